@@ -56,7 +56,7 @@ pub struct SiteMove {
 
 impl SiteMove {
     /// The identity about the mean of the sights' targets; `None` if there are none.
-    fn none(sights: &[Sight]) -> Option<Self> {
+    fn none(sights: &[ComparedPixel]) -> Option<Self> {
         let sum: Vector3<f64> = sights.iter().map(|sight| sight.target.coords).sum();
         (!sights.is_empty()).then(|| Self {
             middle: Point3::from(sum / sights.len() as f64),
@@ -73,7 +73,7 @@ impl SiteMove {
 
     /// How far a moved target misses the second's line of sight, in the line's tangents, rad, and
     /// the derivative of that by shift, turn and relative size.
-    fn miss(&self, sight: &Sight) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>)> {
+    fn miss(&self, sight: &ComparedPixel) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>)> {
         let arm = self.turn * (sight.target - self.middle) * self.size;
         let (towards, range) =
             Unit::try_new_and_get(self.middle + self.shift + arm - sight.from, 1e-6)?;
@@ -120,7 +120,7 @@ pub struct CameraComparison {
 
 /// A pixel of a camera in both calibrations, as a sight line.
 #[derive(Clone, Copy)]
-struct Sight {
+struct ComparedPixel {
     /// The pixel.
     pixel: Pixel,
     /// A target that the pixel shows by the first calibration.
@@ -141,7 +141,8 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
         .iter()
         .filter_map(|camera| Some((camera, second.camera(&camera.name)?)))
         .collect();
-    let sights: Vec<Vec<Sight>> = pairs.iter().map(|(one, other)| sights(one, other)).collect();
+    let sights: Vec<Vec<ComparedPixel>> =
+        pairs.iter().map(|(one, other)| sights(one, other)).collect();
     let has_move = pairs.len() >= LEAST_MOVED;
     let later: Vec<Option<f64>> = pairs.iter().map(|(one, other)| later_s(one, other)).collect();
     let mut known: Vec<f64> = later.iter().copied().flatten().collect();
@@ -170,7 +171,7 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
 }
 
 /// The pixels that both calibrations have a direction for.
-fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
+fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<ComparedPixel> {
     let size = one.camera.model().intrinsics().size;
     let direction = |camera: &CalibratedCamera, pixel: Pixel| {
         let own = camera.camera.model().direction(pixel).ok()?;
@@ -179,7 +180,7 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
     let said = |camera: &CalibratedCamera, pixel| camera.pointing_sd_rad(pixel, one.range_m);
     let sight = |pixel| {
         let target = direction(one, pixel)?.into_inner() * one.range_m;
-        Some(Sight {
+        Some(ComparedPixel {
             pixel,
             target: one.camera.pose().position() + target,
             from: other.camera.pose().position(),
@@ -193,7 +194,7 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
 /// The similarity that brings the first's targets nearest to the second's lines of sight, in
 /// deviations. A camera that was knocked must not draw the site after it: its pixels share one
 /// weight, from heavy tails.
-fn site_move(mut moved: SiteMove, cameras: &[Vec<Sight>]) -> Option<SiteMove> {
+fn site_move(mut moved: SiteMove, cameras: &[Vec<ComparedPixel>]) -> Option<SiteMove> {
     for _ in 0..STEPS {
         let mut information =
             SMatrix::<f64, 7, 7>::from_diagonal(&SVector::from(UNTOLD).map(|sd: f64| sd.powi(-2)));
@@ -228,16 +229,16 @@ fn later_s(one: &CalibratedCamera, other: &CalibratedCamera) -> Option<f64> {
 
 fn camera(
     (one, other): (&CalibratedCamera, &CalibratedCamera),
-    sights: &[Sight],
+    sights: &[ComparedPixel],
     moved: &SiteMove,
     later_s: Option<f64>,
 ) -> CameraComparison {
     // By the tangent: the cosine cannot resolve angles below 1e-8.
-    let angle = |sight: &Sight| {
+    let angle = |sight: &ComparedPixel| {
         let before = moved.applied(sight.target) - sight.from;
         before.cross(&sight.direction).norm().atan2(before.dot(&sight.direction))
     };
-    let mean = |value: &dyn Fn(&Sight) -> f64| {
+    let mean = |value: &dyn Fn(&ComparedPixel) -> f64| {
         (sights.iter().map(value).sum::<f64>() / sights.len() as f64).sqrt()
     };
     let focal = |camera: &CalibratedCamera| camera.camera.model().intrinsics().fx;

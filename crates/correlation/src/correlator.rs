@@ -150,7 +150,7 @@ impl Correlator {
         }
     }
 
-    fn slide<T: crate::direct::Term>(
+    fn slide<T: crate::direct::KernelTerm>(
         &mut self,
         term: T,
         gate: &Plane,

@@ -10,7 +10,7 @@ use crate::Plane;
 const MOST_VECTORS: usize = 5;
 
 /// The term that is accumulated over a kernel: the only difference between the direct measures.
-pub(crate) trait Term: Copy {
+pub(crate) trait KernelTerm: Copy {
     /// The accumulator after one more pair of samples.
     fn step<S: Simd>(self, simd: S, sum: S::f32s, kernel: S::f32s, gate: S::f32s) -> S::f32s;
 }
@@ -27,21 +27,21 @@ pub(crate) struct AbsoluteDifference;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LargestDifference;
 
-impl Term for Product {
+impl KernelTerm for Product {
     #[inline(always)]
     fn step<S: Simd>(self, simd: S, sum: S::f32s, kernel: S::f32s, gate: S::f32s) -> S::f32s {
         simd.mul_add_e_f32s(kernel, gate, sum)
     }
 }
 
-impl Term for AbsoluteDifference {
+impl KernelTerm for AbsoluteDifference {
     #[inline(always)]
     fn step<S: Simd>(self, simd: S, sum: S::f32s, kernel: S::f32s, gate: S::f32s) -> S::f32s {
         simd.add_f32s(sum, simd.abs_f32s(simd.sub_f32s(kernel, gate)))
     }
 }
 
-impl Term for LargestDifference {
+impl KernelTerm for LargestDifference {
     #[inline(always)]
     fn step<S: Simd>(self, simd: S, sum: S::f32s, kernel: S::f32s, gate: S::f32s) -> S::f32s {
         simd.max_f32s(sum, simd.abs_f32s(simd.sub_f32s(kernel, gate)))
@@ -57,7 +57,7 @@ pub(crate) struct Slide<'a, T> {
     pub(crate) out: &'a mut Plane,
 }
 
-impl<T: Term> Slide<'_, T> {
+impl<T: KernelTerm> Slide<'_, T> {
     /// Fills the output, after resizing it to the number of placements, with the widest
     /// instructions of the machine it runs on. The kernel must not be larger than the gate.
     pub(crate) fn run(self) {
@@ -72,7 +72,7 @@ impl<T: Term> Slide<'_, T> {
     }
 }
 
-impl<T: Term> WithSimd for Slide<'_, T> {
+impl<T: KernelTerm> WithSimd for Slide<'_, T> {
     type Output = ();
 
     #[inline(always)]
@@ -100,7 +100,7 @@ impl<T: Term> WithSimd for Slide<'_, T> {
     }
 }
 
-impl<T: Term> Slide<'_, T> {
+impl<T: KernelTerm> Slide<'_, T> {
     /// Computes two rows of `V` vectors of placements.
     #[inline(always)]
     fn block<S: Simd, const V: usize>(&mut self, simd: S, column: usize, row: usize) {
@@ -189,7 +189,7 @@ mod tests {
         Plane::from_fn(width, height, |x, y| ((x * 31 + y * 17 + seed * 101) % 97) as f32 / 10.0)
     }
 
-    fn slid<T: Term>(term: T, gate: &Plane, kernel: &Plane, arch: Arch) -> Plane {
+    fn slid<T: KernelTerm>(term: T, gate: &Plane, kernel: &Plane, arch: Arch) -> Plane {
         let mut out = Plane::default();
         Slide { term, gate, kernel, out: &mut out }.run_on(arch);
         out

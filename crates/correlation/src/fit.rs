@@ -100,7 +100,7 @@ impl Default for FitOptions {
 /// Sums of the planes' samples and of their products (of the deviations from the means, once
 /// centred): the normal equations of a fit.
 #[derive(Clone, Copy, Debug, Default)]
-struct Normal {
+struct FitEquations {
     sums: [f64; PLANES],
     products: [[f64; PLANES]; PLANES],
 }
@@ -163,7 +163,7 @@ impl Fitter {
         fit
     }
 
-    fn normal(&mut self, freedom: Freedom, place: [f64; 2]) -> Normal {
+    fn normal(&mut self, freedom: Freedom, place: [f64; 2]) -> FitEquations {
         let (width, height) = (self.image.width(), self.image.height());
         if freedom == Freedom::ShiftScaleTurn {
             self.by_scale.reshape(width, height);
@@ -212,11 +212,11 @@ impl Fitter {
 struct Products<'a, const N: usize>([&'a Plane; N]);
 
 impl<const N: usize> WithSimd for Products<'_, N> {
-    type Output = Normal;
+    type Output = FitEquations;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) -> Normal {
-        let mut normal = Normal::default();
+    fn with_simd<S: Simd>(self, _: S) -> FitEquations {
+        let mut normal = FitEquations::default();
         let planes = self.0.map(Plane::samples);
         for (i, one) in planes.iter().enumerate() {
             normal.sums[i] = sum(one);
@@ -228,7 +228,7 @@ impl<const N: usize> WithSimd for Products<'_, N> {
     }
 }
 
-impl Normal {
+impl FitEquations {
     /// Moves the sums of four planes to their places among six: model, slopes, nothing, nothing,
     /// image.
     fn spread(self) -> Self {

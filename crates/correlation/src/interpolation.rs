@@ -164,7 +164,7 @@ pub(crate) struct Sampled {
 /// A plane as a cubic spline: it passes through the samples, and its gradient is accurate up to
 /// higher frequencies than that of the four-sample cubic convolution.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Spline {
+pub(crate) struct PlaneSpline {
     padded: Plane,
     lines: Plane,
     /// Coefficients of the samples and of `MARGIN` more on each side.
@@ -174,7 +174,7 @@ pub(crate) struct Spline {
 /// Number of samples beyond the border for which there are coefficients.
 const MARGIN: isize = 2;
 
-impl Spline {
+impl PlaneSpline {
     /// Becomes the spline through a plane's samples; beyond the border the border samples are
     /// repeated.
     pub(crate) fn pass_through(&mut self, plane: &Plane) {
@@ -353,7 +353,7 @@ mod tests {
     fn a_spline_is_true_in_value_and_gradient_where_the_signal_is_smooth() {
         let value = |x: f64, y: f64| (0.9 * x).sin() + 0.5 * (0.7 * y + 0.2 * x).cos();
         let plane = Plane::from_fn(30, 26, |x, y| value(x as f64, y as f64) as f32);
-        let (mut spline, mut part) = (Spline::default(), Sampled::default());
+        let (mut spline, mut part) = (PlaneSpline::default(), Sampled::default());
         part.value.reshape(5, 4);
         spline.pass_through(&plane);
         spline.sample_with_gradient(12.3, 10.8, &mut Resampler::default(), &mut part);

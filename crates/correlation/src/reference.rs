@@ -1,5 +1,5 @@
 use crate::Plane;
-use crate::interpolation::Spline;
+use crate::interpolation::PlaneSpline;
 
 /// Weight of each pixel of a reference: the product of a weight of its column and one of its row.
 /// The weights along each axis sum to 1.
@@ -88,7 +88,7 @@ pub struct Reference {
     image: Plane,
     window: Window,
     kernel: Plane,
-    spline: Spline,
+    spline: PlaneSpline,
     variance: f32,
 }
 
@@ -102,7 +102,7 @@ impl Reference {
         assert!(same, "window and image differ in size");
         let kernel = image.clone();
         let mut reference =
-            Self { image, window, kernel, spline: Spline::default(), variance: 0.0 };
+            Self { image, window, kernel, spline: PlaneSpline::default(), variance: 0.0 };
         reference.prepare();
         reference
     }
@@ -159,7 +159,7 @@ impl Reference {
     }
 
     /// The spline through the image.
-    pub(crate) fn spline(&self) -> &Spline {
+    pub(crate) fn spline(&self) -> &PlaneSpline {
         &self.spline
     }
 

@@ -22,12 +22,12 @@ const STALE: Duration = Duration::from_secs(5);
 /// The metrics page; it disappears when the process ends.
 #[derive(Debug)]
 pub struct MetricsPage {
-    shown: Arc<RwLock<Shown>>,
+    shown: Arc<RwLock<PageText>>,
 }
 
 /// The page's text, and when it was set.
 #[derive(Debug)]
-struct Shown {
+struct PageText {
     text: String,
     at: Instant,
 }
@@ -38,7 +38,7 @@ impl MetricsPage {
     /// # Errors
     /// If the address cannot be listened on.
     pub fn serve(address: SocketAddr) -> anyhow::Result<Self> {
-        let shown = Arc::new(RwLock::new(Shown { text: String::new(), at: Instant::now() }));
+        let shown = Arc::new(RwLock::new(PageText { text: String::new(), at: Instant::now() }));
         let page = Self { shown: Arc::clone(&shown) };
         http::serve("metrics", address, ANSWERED_WITHIN, move |request| answer(request, &shown))?;
         tracing::info!("metrics at http://{address}/metrics");
@@ -50,14 +50,14 @@ impl MetricsPage {
         match exposition(health) {
             Ok(text) => {
                 let mut shown = self.shown.write().unwrap_or_else(PoisonError::into_inner);
-                *shown = Shown { text, at: Instant::now() };
+                *shown = PageText { text, at: Instant::now() };
             }
             Err(error) => tracing::debug!("a report is not shown as metrics: {error}"),
         }
     }
 }
 
-fn answer<B>(request: &Request<B>, shown: &RwLock<Shown>) -> Response<Full<Bytes>> {
+fn answer<B>(request: &Request<B>, shown: &RwLock<PageText>) -> Response<Full<Bytes>> {
     let is_there = request.uri().path() == "/metrics" && request.method() == Method::GET;
     let shown = shown.read().unwrap_or_else(PoisonError::into_inner);
     let (status, text) = if !is_there {

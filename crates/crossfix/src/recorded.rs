@@ -93,7 +93,7 @@ pub fn for_each_until(
     let mut is_stopped = false;
     let read = for_each(path, lacks, |lacks, entry| {
         is_stopped = shutdown.requested();
-        anyhow::ensure!(!is_stopped, Found);
+        anyhow::ensure!(!is_stopped, SearchOver);
         handle(lacks, entry)
     });
     if is_stopped { Ok(()) } else { read }
@@ -107,10 +107,10 @@ pub fn find<T>(
     let mut found = None;
     let read = RecordingReader::open(path)?.for_each(|entry| {
         found = answer(entry);
-        if found.is_some() { Err(Found) } else { Ok(()) }
+        if found.is_some() { Err(SearchOver) } else { Ok(()) }
     });
     match read {
-        Ok(_) | Err(ReadFailure::Handler(Found)) => Ok(found),
+        Ok(_) | Err(ReadFailure::Handler(SearchOver)) => Ok(found),
         Err(ReadFailure::Recording(error)) => Err(error.into()),
     }
 }
@@ -118,7 +118,7 @@ pub fn find<T>(
 /// Signals that the search is over, so the rest need not be read.
 #[derive(Debug, thiserror::Error)]
 #[error("found")]
-struct Found;
+struct SearchOver;
 
 /// An error of the handler's.
 #[derive(Debug, thiserror::Error)]

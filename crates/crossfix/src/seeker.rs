@@ -17,7 +17,7 @@ use crossfix_message::{
 };
 use nalgebra::{Matrix2, Rotation3, Unit, Vector3};
 
-use self::place::{Place, long_axis, place_at, squared_distance};
+use self::place::{PredictedDirection, long_axis, place_at, squared_distance};
 
 /// Validity of a cue after it came, s of data time: as far as cues look ahead.
 const VALID_S: f64 = 2.0;
@@ -103,7 +103,7 @@ struct Search {
 
 /// A track that may be the target, and the number of images for which it has been.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Candidate {
+struct CandidateTrack {
     image_track: u64,
     images: u32,
     seen: Timestamp,
@@ -122,7 +122,7 @@ pub struct Seeker {
     /// The target looked for, and its last expected direction, in the frame at rest.
     of: Option<Cued>,
     last: Option<Unit<Vector3<f64>>>,
-    candidate: Option<Candidate>,
+    candidate: Option<CandidateTrack>,
     /// When the target was last recognised, in this view or an earlier one.
     found: Option<Timestamp>,
     search: Option<Search>,
@@ -203,10 +203,10 @@ impl Seeker {
     /// The cue to follow, and the predicted place of its target: that of the present target; if
     /// that is gone, or its cue is of no track and has led to nothing while surer ones exist, the
     /// best other cue.
-    fn choose(&mut self, time: Timestamp) -> Option<(Cue, Place)> {
+    fn choose(&mut self, time: Timestamp) -> Option<(Cue, PredictedDirection)> {
         let is_sure = |cue: &Cue| cue.of.as_ref().is_some_and(|of| of.track_id != 0);
         let is_found = self.found.is_some_and(|found| is_lately(found, time, FOUND_S));
-        let reached: Vec<(&Cue, Place)> = self
+        let reached: Vec<(&Cue, PredictedDirection)> = self
             .cues
             .cues
             .iter()
@@ -218,7 +218,8 @@ impl Seeker {
         let same = same.filter(|(cue, _)| is_sure(cue) || is_found || sure().next().is_none());
         // When a single camera's target becomes a track its cue changes its name: the track nearest
         // to the last direction is taken for it.
-        let away = |place: &Place| self.last.map_or(TAU, |last| last.angle(&place.direction));
+        let away =
+            |place: &PredictedDirection| self.last.map_or(TAU, |last| last.angle(&place.direction));
         let beside = sure().min_by(|a, b| away(&a.1).total_cmp(&away(&b.1)));
         let beside = beside.filter(|(_, place)| away(place) < self.half_view);
         let best = same.or(beside).or_else(|| sure().next()).or(reached.first());
@@ -231,7 +232,7 @@ impl Seeker {
     }
 
     /// Whether a predicted place, within its uncertainty, can be brought into view.
-    fn reaches(&self, place: &Place) -> bool {
+    fn reaches(&self, place: &PredictedDirection) -> bool {
         let (_, long_sd) = long_axis(place);
         let (nearest, view) = match &self.mount {
             Some(mount) => (axis(mount, mount.aim(&place.direction)), self.half_view),
@@ -243,7 +244,7 @@ impl Seeker {
     /// The track that has matched the cue's prediction for long enough, if any.
     fn recognise(
         &mut self,
-        now: &Place,
+        now: &PredictedDirection,
         angles: ScanAngles,
         tracks: &[BearingTrack],
         time: Timestamp,
@@ -251,7 +252,7 @@ impl Seeker {
         let turned = self.mount.map_or_else(Rotation3::identity, |mount| turn_of(&mount, angles));
         let seen = tracks.iter().filter(|track| track.state() == ImageTrackState::Tracking);
         let angle_sd_rad = self.mount.map_or(0.0, |_| self.angle_sd_rad);
-        let now = Place {
+        let now = PredictedDirection {
             covariance: now.covariance + Matrix2::identity() * angle_sd_rad.powi(2),
             ..*now
         };
@@ -276,7 +277,7 @@ impl Seeker {
         };
         let before = self.candidate.filter(|before| before.image_track == image_track);
         let images = before.map_or(1, |before| before.images + 1);
-        self.candidate = Some(Candidate { image_track, images, seen: time });
+        self.candidate = Some(CandidateTrack { image_track, images, seen: time });
         (images >= IMAGES).then_some(image_track)
     }
 
@@ -286,7 +287,7 @@ impl Seeker {
         mount: &PanTilt,
         pointed: Pointed,
         cue: &Cue,
-        now: &Place,
+        now: &PredictedDirection,
         time: Timestamp,
     ) -> Option<ScanAngles> {
         let (angles, is_settled) = match pointed {
@@ -333,7 +334,7 @@ impl Seeker {
         &mut self,
         mount: &PanTilt,
         angles: ScanAngles,
-        now: &Place,
+        now: &PredictedDirection,
         (axis, long_sd): (Vector3<f64>, f64),
         time: Timestamp,
     ) -> Option<ScanAngles> {

@@ -30,7 +30,7 @@ pub use history::TrackHistory;
 pub use latency::{Latency, LatencyRecorder};
 pub use metrics::{Estimate, Evaluator, Nees, Report, TargetReport, TrueTarget};
 pub use papers::{
-    Limit, Row, Table, ValidationOptions, Verdict, validate_fusion, validate_tracker,
+    Limit, Table, TableRow, ValidationOptions, Verdict, validate_fusion, validate_tracker,
 };
 pub use sightings::Sightings;
 pub use stretches::Delays;

@@ -137,7 +137,7 @@ pub struct Report {
 }
 
 #[derive(Clone, Debug, Default)]
-struct Sums {
+struct ErrorSums {
     position: f64,
     velocity: f64,
     /// NEES of both together, of the position and of the velocity, one entry per pair.
@@ -145,7 +145,7 @@ struct Sums {
     pairs: u64,
 }
 
-impl Sums {
+impl ErrorSums {
     fn add(&mut self, truth: &TrueTarget, state: &KinematicState) {
         let position = state.position() - truth.position;
         let velocity = state.velocity() - truth.velocity;
@@ -177,8 +177,8 @@ impl Sums {
 }
 
 #[derive(Clone, Debug, Default)]
-struct Target {
-    sums: Sums,
+struct TruthTarget {
+    sums: ErrorSums,
     instants: u64,
     last_track: Option<u64>,
     switches: u64,
@@ -219,8 +219,8 @@ impl Answers {
 pub struct Evaluator {
     cutoff: f64,
     instants: u64,
-    targets: BTreeMap<u64, Target>,
-    all: Sums,
+    targets: BTreeMap<u64, TruthTarget>,
+    all: ErrorSums,
     false_instants: u64,
     answers: Answers,
     stretches: Stretches,
@@ -238,7 +238,7 @@ impl Evaluator {
             cutoff: cutoff_m,
             instants: 0,
             targets: BTreeMap::new(),
-            all: Sums::default(),
+            all: ErrorSums::default(),
             false_instants: 0,
             answers: Answers::default(),
             stretches: Stretches::default(),
@@ -342,7 +342,7 @@ impl Evaluator {
     }
 }
 
-fn target_report(id: u64, target: &Target) -> TargetReport {
+fn target_report(id: u64, target: &TruthTarget) -> TargetReport {
     let sums = &target.sums;
     let [nees, position_nees, velocity_nees] = sums.nees();
     TargetReport {

@@ -1,6 +1,6 @@
 //! The figures of the fusion, with few runs: what must be must be already with these.
 
-use crossfix_evaluation::{Row, Table, ValidationOptions, Verdict, validate_fusion};
+use crossfix_evaluation::{Table, TableRow, ValidationOptions, Verdict, validate_fusion};
 
 fn tables(only: &str, runs: usize) -> Vec<Table> {
     let tables = validate_fusion(ValidationOptions { runs, seed: 3 }, only, |_, _, _| {});
@@ -9,14 +9,14 @@ fn tables(only: &str, runs: usize) -> Vec<Table> {
 }
 
 /// The rows of a table that are not what they must be; that some are asked for is sure.
-fn failures<'a>(tables: &'a [Table], name: &str) -> Vec<&'a Row> {
+fn failures<'a>(tables: &'a [Table], name: &str) -> Vec<&'a TableRow> {
     let table = tables.iter().find(|table| table.name == name);
     let table = table.unwrap_or_else(|| panic!("there is no table {name}"));
     assert!(table.rows.iter().any(|row| row.limit.is_some()), "nothing is asked of {name}");
     table.rows.iter().filter(|row| row.verdict() == Verdict::Fail).collect()
 }
 
-const NONE: [&Row; 0] = [];
+const NONE: [&TableRow; 0] = [];
 
 #[test]
 fn both_algorithms_find_what_the_reference_finds() {

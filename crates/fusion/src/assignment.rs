@@ -12,7 +12,7 @@ const MAX_KNOT: usize = 40_000;
 
 /// A row and a column that may be paired, and the gain of that over leaving both alone.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Candidate {
+pub(crate) struct Pairing {
     pub(crate) row: usize,
     pub(crate) column: usize,
     pub(crate) gain: f64,
@@ -23,7 +23,7 @@ pub(crate) struct Candidate {
 ///
 /// Candidates that touch no other's row or column decide themselves; only clusters of several are
 /// solved as a whole, so the cost grows with the clusters and not with the site.
-pub(crate) fn assign(candidates: &[Candidate]) -> Vec<(usize, usize)> {
+pub(crate) fn assign(candidates: &[Pairing]) -> Vec<(usize, usize)> {
     let mut pairs: Vec<(usize, usize)> =
         clusters(candidates).iter().flat_map(|cluster| solve(cluster)).collect();
     pairs.sort_unstable();
@@ -31,7 +31,7 @@ pub(crate) fn assign(candidates: &[Candidate]) -> Vec<(usize, usize)> {
 }
 
 /// Groups of candidates that are linked through rows and columns.
-fn clusters(candidates: &[Candidate]) -> Vec<Vec<Candidate>> {
+fn clusters(candidates: &[Pairing]) -> Vec<Vec<Pairing>> {
     let mut leader: Vec<usize> = (0..candidates.len()).collect();
     fn find(leader: &mut [usize], mut i: usize) -> usize {
         while leader[i] != i {
@@ -49,18 +49,18 @@ fn clusters(candidates: &[Candidate]) -> Vec<Vec<Candidate>> {
             leader[a.max(b)] = a.min(b);
         }
     }
-    let mut clusters: BTreeMap<usize, Vec<Candidate>> = BTreeMap::new();
+    let mut clusters: BTreeMap<usize, Vec<Pairing>> = BTreeMap::new();
     for (i, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.gain > 0.0) {
         clusters.entry(find(&mut leader, i)).or_default().push(*candidate);
     }
     clusters.into_values().collect()
 }
 
-fn solve(cluster: &[Candidate]) -> Vec<(usize, usize)> {
+fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
     if let [only] = cluster {
         return vec![(only.row, only.column)];
     }
-    let places = |of: fn(&Candidate) -> usize| {
+    let places = |of: fn(&Pairing) -> usize| {
         let mut values: Vec<usize> = cluster.iter().map(of).collect();
         values.sort_unstable();
         values.dedup();
@@ -86,7 +86,7 @@ fn solve(cluster: &[Candidate]) -> Vec<(usize, usize)> {
         .collect()
 }
 
-fn greedy(cluster: &[Candidate]) -> Vec<(usize, usize)> {
+fn greedy(cluster: &[Pairing]) -> Vec<(usize, usize)> {
     let mut by_gain = cluster.to_vec();
     by_gain.sort_by(|a, b| {
         b.gain.total_cmp(&a.gain).then(a.row.cmp(&b.row)).then(a.column.cmp(&b.column))
@@ -109,8 +109,7 @@ mod tests {
     use super::*;
 
     fn all(gains: &[(usize, usize, f64)]) -> Vec<(usize, usize)> {
-        let candidate =
-            |&(row, column, gain): &(usize, usize, f64)| Candidate { row, column, gain };
+        let candidate = |&(row, column, gain): &(usize, usize, f64)| Pairing { row, column, gain };
         assign(&gains.iter().map(candidate).collect::<Vec<_>>())
     }
 

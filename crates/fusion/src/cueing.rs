@@ -16,7 +16,7 @@ use crossfix_message::{
 use nalgebra::{Matrix2, Matrix3, Point3, Rotation3, Unit, Vector3, Vector6};
 
 use crate::cameras::KnownCamera;
-use crate::range_chart::Chart;
+use crate::range_chart::StateChart;
 use crate::uncertainty::{CameraUncertainty, SharedTies};
 
 /// Interval between the cues for a camera, s of data time: in that time a target at 100 m that
@@ -40,7 +40,7 @@ const NODES: [(f64, f64); 5] = [
 
 /// A target's predicted states for cueing, at one time.
 #[derive(Clone, Debug)]
-pub(crate) struct Known {
+pub(crate) struct CueTarget {
     /// Its identity.
     pub(crate) of: Cued,
     /// Position and velocity now and at each time ahead.
@@ -49,7 +49,7 @@ pub(crate) struct Known {
     pub(crate) seen_from: Option<Point3<f64>>,
 }
 
-impl Known {
+impl CueTarget {
     /// A target whose state at any time from `now` on is given by `expected`.
     pub(crate) fn new(
         of: Cued,
@@ -95,7 +95,7 @@ pub(crate) fn cues(
     camera: &CameraName,
     known: &KnownCamera,
     (now, clock): (Timestamp, OwnClock),
-    targets: &[Known],
+    targets: &[CueTarget],
     max_range_m: f64,
 ) -> CueFrame {
     let own_now = now.plus_seconds(clock.ahead_s);
@@ -122,7 +122,7 @@ pub(crate) fn cues(
 fn cue(
     camera: (&KnownCamera, &CameraUncertainty),
     own_now: Timestamp,
-    target: &Known,
+    target: &CueTarget,
 ) -> Option<Cue> {
     let origin = camera.0.camera.pose().position();
     let here = &target.ahead[0];
@@ -178,7 +178,7 @@ fn seen(
     origin: Point3<f64>,
     seen_from: Option<Point3<f64>>,
 ) -> Option<(Unit<Vector3<f64>>, Matrix2<f64>)> {
-    let places = match seen_from.and_then(|from| Chart::by_range(from, state)) {
+    let places = match seen_from.and_then(|from| StateChart::by_range(from, state)) {
         Some(chart) => along_range(&chart, state),
         None => vec![(1.0, state.position(), state.position_covariance())],
     };
@@ -207,7 +207,10 @@ fn seen(
 
 /// Positions along an uncertain range, with their weights and the remaining covariance of each
 /// position once the range is given.
-fn along_range(chart: &Chart, state: &KinematicState) -> Vec<(f64, Point3<f64>, Matrix3<f64>)> {
+fn along_range(
+    chart: &StateChart,
+    state: &KinematicState,
+) -> Vec<(f64, Point3<f64>, Matrix3<f64>)> {
     let (covariance, _) = chart.expressed(&state.covariance, &SharedTies::zeros());
     let variance = covariance.m33;
     if variance <= 0.0 {

@@ -26,7 +26,7 @@ const ALONE: f64 = 0.4;
 
 /// How an exposure arrived.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Arrival {
+pub(crate) enum ExposureArrival {
     /// After all others of its camera.
     InOrder,
     /// After a newer one of its camera, but still in time.
@@ -78,7 +78,7 @@ pub(crate) struct EventBuffer {
     /// How far time has gone on, s.
     run_s: f64,
     /// The time that the live cameras agree on, and how many they were, when a frame last came.
-    reference: Option<Reference>,
+    reference: Option<CommonTime>,
     /// [`Self::run_s`] since which most live cameras have been behind what was released.
     behind_since_s: Option<f64>,
     /// Exposures that were waiting when the order started again.
@@ -95,7 +95,7 @@ pub(crate) struct EventBuffer {
 
 /// Common time of the live cameras, and how many there are.
 #[derive(Clone, Copy, Debug)]
-struct Reference {
+struct CommonTime {
     time: Timestamp,
     live: usize,
 }
@@ -125,7 +125,10 @@ impl EventBuffer {
     }
 
     /// Takes an exposure in; nothing is released before [`Self::release`] says so.
-    pub(crate) fn insert(&mut self, exposure: Exposure) -> Result<Arrival, RejectionReason> {
+    pub(crate) fn insert(
+        &mut self,
+        exposure: Exposure,
+    ) -> Result<ExposureArrival, RejectionReason> {
         let (time, max_ahead_s) = (exposure.time, self.config.max_ahead_s);
         if let Some(source) = self.sources.get_mut(&exposure.camera) {
             source.ended = false;
@@ -170,12 +173,16 @@ impl EventBuffer {
     }
 
     /// Notes an exposure's time, whatever becomes of the exposure.
-    fn hear(&mut self, exposure: &Exposure) -> Arrival {
+    fn hear(&mut self, exposure: &Exposure) -> ExposureArrival {
         let (time, lateness_s) = (exposure.time, self.config.lateness_s);
         let late_s = self.late_s(exposure);
         let source = self.sources.entry(exposure.camera.clone()).or_default();
         let stream = source.stream.get_or_insert(Stream::beginning(time));
-        let arrival = if time < stream.newest { Arrival::OutOfOrder } else { Arrival::InOrder };
+        let arrival = if time < stream.newest {
+            ExposureArrival::OutOfOrder
+        } else {
+            ExposureArrival::InOrder
+        };
         // A clock that races makes nobody else look silent, nor does one that catches up on lost
         // time.
         let reached = self.reference.map(|reference| reference.time.plus_seconds(-lateness_s));
@@ -208,7 +215,7 @@ impl EventBuffer {
 
     /// Notes the cameras that are further behind than anybody waits.
     fn note_who_is_behind(&mut self) {
-        let Some(Reference { time, .. }) = self.reference else { return };
+        let Some(CommonTime { time, .. }) = self.reference else { return };
         let (patience, run_s) = (time.plus_seconds(-self.config.lateness_s), self.run_s);
         for stream in self.sources.values_mut().filter_map(|source| source.stream.as_mut()) {
             let since_s = stream.behind_since_s.unwrap_or(run_s);
@@ -241,7 +248,7 @@ impl EventBuffer {
         };
         let is_behind = |time: &Timestamp| self.released.seconds_since(*time) > patience_s;
         let behind = newest.iter().filter(|time| is_behind(time)).count();
-        self.reference = time.map(|time| Reference { time, live: live.len() });
+        self.reference = time.map(|time| CommonTime { time, live: live.len() });
         if behind <= half {
             self.behind_since_s = None;
             return;
@@ -353,7 +360,7 @@ impl EventBuffer {
             return Some(Timestamp::MAX);
         }
         let lateness_s = self.config.lateness_s;
-        let Reference { time: reference, live } = self.reference?;
+        let CommonTime { time: reference, live } = self.reference?;
         let patience = reference.plus_seconds(-lateness_s);
         let forgotten = reference.plus_seconds(-PATIENCES * lateness_s);
         let is_expected = |source: &Source| source.stream.is_none() && !source.ended;

@@ -9,19 +9,19 @@ use crossfix_message::{
     TrackFrame,
 };
 
-use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera, PoseFinding, Sample};
+use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera, PoseFinding, ScaleSample};
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::cueing::Cueing;
-use crate::event_time::{Arrival, EventBuffer, ReorderQueue};
+use crate::event_time::{EventBuffer, ExposureArrival, ReorderQueue};
 use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
-use crate::motion::Motion;
-use crate::site_time::{SiteTime, Turn, moved};
+use crate::motion::TrackMotion;
+use crate::site_time::{FrameDecision, SiteTime, moved};
 use crate::track::{Track, TrackId};
 use crate::tracker::{TrackChange, Tracker};
 use smoothing::Smoothing;
 
-use crate::uncertainty::{LastingNoise, pose_covariance_of_careful_survey};
+use crate::uncertainty::{SharedNoise, pose_covariance_of_careful_survey};
 use crate::unmet::{Unmet, WhyNothing};
 use crate::{ConfigError, Counters, FusionConfig};
 
@@ -85,7 +85,7 @@ impl Fusion {
     /// [`ConfigError`] if a number of the configuration makes no sense.
     pub fn new(config: FusionConfig) -> Result<Self, ConfigError> {
         config.validate()?;
-        let motion = Motion::new(&config.tracking)?;
+        let motion = TrackMotion::new(&config.tracking)?;
         Ok(Self {
             cameras: Cameras::new(config.tracking.coasting_after_s),
             buffer: EventBuffer::new(config.event_time.clone()),
@@ -115,7 +115,7 @@ impl Fusion {
         let is_declared = calibration.pose_covariance.is_some();
         let declared = calibration.pose_covariance;
         let pose_covariance = declared.unwrap_or_else(pose_covariance_of_careful_survey);
-        let lasting = calibration.lasting_noise.map_or(LastingNoise::NONE, |noise| LastingNoise {
+        let lasting = calibration.lasting_noise.map_or(SharedNoise::NONE, |noise| SharedNoise {
             sd_rad: noise.sd_rad,
             time_s: noise.time_s,
         });
@@ -140,11 +140,13 @@ impl Fusion {
         let mut outputs = Vec::new();
         let name = frame.camera.parse::<CameraName>().ok();
         let known = name.filter(|name| self.cameras.get(name).is_some());
-        match known.map_or(Turn::Now, |name| self.site_time.see(&name, frame)) {
-            Turn::Now => self.take(frame, &mut outputs),
-            Turn::Waits => {}
-            Turn::Together(frames, step_s) => self.take_after(&frames, step_s, &mut outputs),
-            Turn::Apart(frames, apart) => self.take_apart(&frames, &apart, &mut outputs),
+        match known.map_or(FrameDecision::Now, |name| self.site_time.see(&name, frame)) {
+            FrameDecision::Now => self.take(frame, &mut outputs),
+            FrameDecision::Waits => {}
+            FrameDecision::Together(frames, step_s) => {
+                self.take_after(&frames, step_s, &mut outputs);
+            }
+            FrameDecision::Apart(frames, apart) => self.take_apart(&frames, &apart, &mut outputs),
         }
         self.drain(&mut outputs);
         outputs
@@ -178,8 +180,8 @@ impl Fusion {
                     self.restart(time, outputs);
                 }
                 match arrival {
-                    Ok(Arrival::InOrder) => {}
-                    Ok(Arrival::OutOfOrder) => self.counters.count("frames_out_of_order"),
+                    Ok(ExposureArrival::InOrder) => {}
+                    Ok(ExposureArrival::OutOfOrder) => self.counters.count("frames_out_of_order"),
                     Err(reason) => self.refuse(refused(frame, reason), outputs),
                 }
             }
@@ -343,8 +345,8 @@ impl Fusion {
         for samples in self.tracker.draws() {
             // The error of a mount's angles is a new one after each turn: cameras on mounts are
             // left out.
-            let is_fixed = |sample: &Sample| !self.cameras.is_on_mount(&sample.camera);
-            let samples: Vec<Sample> = samples.into_iter().filter(is_fixed).collect();
+            let is_fixed = |sample: &ScaleSample| !self.cameras.is_on_mount(&sample.camera);
+            let samples: Vec<ScaleSample> = samples.into_iter().filter(is_fixed).collect();
             if samples.len() < 2 {
                 continue;
             }

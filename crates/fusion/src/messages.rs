@@ -3,7 +3,7 @@
 use crossfix_filter::KinematicState;
 use crossfix_message::{CameraResidual, Payload, Timestamp, TrackEvent, TrackState};
 
-use crate::motion::Motion;
+use crate::motion::TrackMotion;
 use crate::spatial::Quantity;
 use crate::track::{Track, TrackStatus};
 use crate::tracker::TrackChange;
@@ -21,7 +21,11 @@ pub(crate) fn event(change: TrackChange, time: Timestamp) -> TrackEvent {
 }
 
 /// The message of a track, with its state predicted to `time`.
-pub(crate) fn track(track: &Track, time: Timestamp, motion: &Motion) -> crossfix_message::Track {
+pub(crate) fn track(
+    track: &Track,
+    time: Timestamp,
+    motion: &TrackMotion,
+) -> crossfix_message::Track {
     let now = track.predicted(time, motion);
     let state = match track.status {
         TrackStatus::Tentative => TrackState::Tentative,

@@ -13,7 +13,7 @@ pub(crate) const REINITIALISED_POSITION_SD: f64 = 1.0;
 
 /// The motion models of all tracks, and the detector that a new track gets.
 #[derive(Clone, Debug)]
-pub(crate) struct Motion {
+pub(crate) struct TrackMotion {
     /// For tracks that several cameras see.
     models: MotionModels,
     /// For tracks that one camera alone sees: the motion along its sight line cannot be observed,
@@ -21,19 +21,19 @@ pub(crate) struct Motion {
     unranged: MotionModels,
     /// How long after its bearing a camera counts as one that holds (supports) a track, s.
     pub(crate) holding_s: f64,
-    detector: Option<Detector>,
+    detector: Option<ManoeuvreDetector>,
 }
 
 /// A detector of manoeuvres (Kalinov 2019).
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Detector {
+pub(crate) enum ManoeuvreDetector {
     /// The paper's, on the smoothed residual.
     Residual(SmoothedResidual),
     /// On the normalised innovation squared.
     Innovation(NormalisedInnovation),
 }
 
-impl Motion {
+impl TrackMotion {
     pub(crate) fn new(config: &Tracking) -> Result<Self, ConfigError> {
         let single = MotionModels::single(config.acceleration_density);
         let (models, detector) = match config.manoeuvres {
@@ -54,14 +54,14 @@ impl Motion {
             Manoeuvres::None => (single, None),
             Manoeuvres::SmoothedResidual => {
                 let detector = SmoothedResidual::new(config.residual_window, config.residual_scale);
-                (single, Some(Detector::Residual(detector)))
+                (single, Some(ManoeuvreDetector::Residual(detector)))
             }
             Manoeuvres::Innovation => {
                 let detector = NormalisedInnovation::new(
                     config.innovation_window,
                     config.innovation_false_alarm,
                 );
-                (single, Some(Detector::Innovation(detector)))
+                (single, Some(ManoeuvreDetector::Innovation(detector)))
             }
         };
         let models = models.ok_or(ConfigError {
@@ -84,7 +84,7 @@ impl Motion {
         self.models.models().iter().zip(probabilities).map(|(model, p)| model.density * p).sum()
     }
 
-    pub(crate) fn detector(&self) -> Option<Detector> {
+    pub(crate) fn detector(&self) -> Option<ManoeuvreDetector> {
         self.detector.clone()
     }
 }

@@ -69,14 +69,14 @@ pub(crate) struct GivenShift {
 
 /// How well a bearing fits a prediction.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Fit {
+pub(crate) struct BearingFit {
     /// Squared Mahalanobis distance with the process noise of the liveliest model: the gate's test.
     pub(crate) gate_distance: f64,
     /// Logarithm of the bearing's probability density over all models, 1/sr.
     pub(crate) log_density: f64,
 }
 
-impl Fit {
+impl BearingFit {
     /// Log-likelihood ratio of two explanations of the bearing: a target that is detected with
     /// probability `detection`, or clutter of density `clutter_per_sr` (1/sr).
     pub(crate) fn log_ratio(&self, detection: f64, clutter_per_sr: f64) -> f64 {
@@ -202,11 +202,11 @@ impl BearingPrediction {
 
     /// How well a bearing fits; `None` if it lies outside the gate. Of the two cases, that the
     /// camera's lasting errors went on or that they were drawn again, the likelier is used.
-    pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
+    pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<BearingFit> {
         let offset = self.model.offset(line)?;
         let known = self.fit_by(&self.known, offset, line, gate);
         let Some((renewed, probability)) = &self.renewed else { return known };
-        Fit::likelier(known, self.fit_by(renewed, offset, line, gate), *probability)
+        BearingFit::likelier(known, self.fit_by(renewed, offset, line, gate), *probability)
     }
 
     fn fit_by(
@@ -215,7 +215,7 @@ impl BearingPrediction {
         offset: Vector2<f64>,
         line: &SightLine,
         gate: Gate,
-    ) -> Option<Fit> {
+    ) -> Option<BearingFit> {
         let innovation = offset - by.shifted;
         // A variance along any axis is at most the trace: this cheap test rejects most bearings.
         let longest = by.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
@@ -236,7 +236,7 @@ impl BearingPrediction {
                 density += weight * (-squared / 2.0).exp() / (2.0 * PI * determinant.sqrt());
             }
         }
-        Some(Fit { gate_distance, log_density: density.ln() })
+        Some(BearingFit { gate_distance, log_density: density.ln() })
     }
 }
 

@@ -20,7 +20,7 @@ use crate::uncertainty::SharedTies;
 // Made and used in one update: never stored, so the size of the larger variant costs nothing.
 #[allow(clippy::large_enum_variant)]
 #[derive(Clone, Debug)]
-pub(crate) enum Chart {
+pub(crate) enum StateChart {
     /// Position and velocity: for targets that several cameras place.
     Cartesian(KinematicState),
     /// Direction, range and velocity by range: for targets that one camera alone follows.
@@ -50,7 +50,7 @@ pub(crate) struct ChartPoint {
     pub(crate) state_by: Matrix6<f64>,
 }
 
-impl Chart {
+impl StateChart {
     /// The Cartesian chart about a state, for a target that several cameras place.
     pub(crate) fn cartesian(state: &KinematicState) -> Self {
         Self::Cartesian(state.clone())

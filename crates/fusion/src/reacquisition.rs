@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use crossfix_filter::Gate;
 
 use crate::cameras::KnownCamera;
-use crate::motion::Motion;
+use crate::motion::TrackMotion;
 use crate::track::{Track, TrackId};
 use crate::visibility::log_missed;
 use crate::{Exposure, Tracking};
@@ -39,10 +39,10 @@ pub(crate) struct Reacquisition {
 }
 
 /// An exposure with what it is compared by.
-pub(crate) struct Context<'a> {
+pub(crate) struct ReacquisitionContext<'a> {
     pub(crate) exposure: &'a Exposure,
     pub(crate) known: &'a KnownCamera,
-    pub(crate) motion: &'a Motion,
+    pub(crate) motion: &'a TrackMotion,
     pub(crate) config: &'a Tracking,
     pub(crate) gate: Gate,
     pub(crate) max_range_m: f64,
@@ -50,7 +50,7 @@ pub(crate) struct Context<'a> {
     pub(crate) owners: &'a [Option<TrackId>],
 }
 
-impl Context<'_> {
+impl ReacquisitionContext<'_> {
     /// The sightings (by index) in a track's gate, with their log-likelihood ratios against
     /// strangers, the best first.
     fn fits(&self, track: &Track, owner: TrackId) -> Vec<(f64, usize)> {
@@ -136,7 +136,7 @@ impl Reacquisition {
     pub(crate) fn advance(
         &mut self,
         tracks: &BTreeMap<TrackId, Track>,
-        context: &Context<'_>,
+        context: &ReacquisitionContext<'_>,
     ) -> Vec<(Track, Option<usize>)> {
         self.leaves.retain(|id, _| tracks.get(id).is_some_and(|track| !track.is_held()));
         let mut found = Vec::new();

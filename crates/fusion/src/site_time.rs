@@ -127,7 +127,7 @@ impl Rhythm {
 
 /// The step of a clock.
 #[derive(Clone, Copy, Debug)]
-struct Step {
+struct ClockStep {
     step_s: f64,
     /// The camera's rhythm before the step.
     before: Rhythm,
@@ -135,7 +135,7 @@ struct Step {
     others_s: f64,
 }
 
-impl Step {
+impl ClockStep {
     /// Whether the clock has stepped, by its camera's rhythm now: it is neither a camera that stood
     /// still, nor a single frame with a wrong time.
     fn is_of_clock(&self, now: &Rhythm) -> bool {
@@ -151,14 +151,14 @@ impl Step {
 #[derive(Debug, Default)]
 struct Pending {
     frames: Vec<BearingFrame>,
-    steps: BTreeMap<CameraName, Step>,
+    steps: BTreeMap<CameraName, ClockStep>,
     /// How far each camera had gone on at the first of these steps, s.
     gone_s: BTreeMap<CameraName, f64>,
 }
 
 /// Decision on a frame.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Turn {
+pub(crate) enum FrameDecision {
     /// The frame is taken at once.
     Now,
     /// The frame waits.
@@ -196,7 +196,7 @@ impl SiteTime {
     }
 
     /// Takes a known camera's frame.
-    pub(crate) fn see(&mut self, camera: &CameraName, frame: &BearingFrame) -> Turn {
+    pub(crate) fn see(&mut self, camera: &CameraName, frame: &BearingFrame) -> FrameDecision {
         let (sequence, time) = (frame.sequence, Timestamp::from_nanos(frame.capture_time_ns));
         let others = self.newest_of_others(camera);
         let rhythm =
@@ -226,17 +226,17 @@ impl SiteTime {
             let pending = self
                 .pending
                 .get_or_insert_with(|| Pending { gone_s: gone_s(), ..Pending::default() });
-            pending.steps.entry(camera.clone()).or_insert(Step { step_s, before, others_s });
+            pending.steps.entry(camera.clone()).or_insert(ClockStep { step_s, before, others_s });
         }
         let Some(pending) = &mut self.pending else {
-            return Turn::Now;
+            return FrameDecision::Now;
         };
         let waits = pending.steps.contains_key(camera);
         if waits {
             pending.frames.push(frame.clone());
         }
         let Some(step) = self.decide() else {
-            return if waits { Turn::Waits } else { Turn::Now };
+            return if waits { FrameDecision::Waits } else { FrameDecision::Now };
         };
         let apart = step.is_none().then(|| self.part());
         let mut frames = self.end();
@@ -244,8 +244,8 @@ impl SiteTime {
             frames.push(frame.clone());
         }
         match (step, apart) {
-            (Some(step_s), _) => Turn::Together(frames, step_s),
-            (None, apart) => Turn::Apart(frames, apart.unwrap_or_default()),
+            (Some(step_s), _) => FrameDecision::Together(frames, step_s),
+            (None, apart) => FrameDecision::Apart(frames, apart.unwrap_or_default()),
         }
     }
 

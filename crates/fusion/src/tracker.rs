@@ -9,10 +9,10 @@ use std::collections::BTreeMap;
 use crossfix_filter::{Gate, KinematicState};
 use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 
-use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, Sample};
-use crate::cueing::Known;
-use crate::motion::Motion;
-use crate::reacquisition::{Context, Reacquisition};
+use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, ScaleSample};
+use crate::cueing::CueTarget;
+use crate::motion::TrackMotion;
+use crate::reacquisition::{Reacquisition, ReacquisitionContext};
 use crate::track::{Track, TrackId, TrackStatus};
 
 use association::fitting;
@@ -42,7 +42,7 @@ impl TrackChange {
 #[derive(Debug)]
 pub(crate) struct Tracker {
     config: Tracking,
-    motion: Motion,
+    motion: TrackMotion,
     gate: Gate,
     /// Beyond this range no camera is expected to see a target, m.
     max_range_m: f64,
@@ -64,7 +64,7 @@ struct Noted {
 
 /// Result of an exposure.
 #[derive(Debug)]
-pub(crate) struct Step {
+pub(crate) struct TrackerStep {
     /// The sightings that belong to no track, or to a track that only one camera supports.
     pub(crate) free: Vec<Sighting>,
     /// Which of them (by index) such a weakly supported track has used.
@@ -82,7 +82,7 @@ pub(crate) struct Step {
 }
 
 impl Tracker {
-    pub(crate) fn new(config: Tracking, max_range_m: f64, motion: Motion) -> Self {
+    pub(crate) fn new(config: Tracking, max_range_m: f64, motion: TrackMotion) -> Self {
         let gate = Gate::with_probability(config.gate_probability);
         Self {
             config,
@@ -139,7 +139,7 @@ impl Tracker {
     }
 
     /// All confirmed targets with their predicted states, for cueing.
-    pub(crate) fn known(&self, now: Timestamp) -> Vec<Known> {
+    pub(crate) fn known(&self, now: Timestamp) -> Vec<CueTarget> {
         let sure = self.tracks.values().filter(|track| track.is_confirmed());
         sure.map(|track| track.known(now, &self.motion)).collect()
     }
@@ -155,7 +155,7 @@ impl Tracker {
     }
 
     /// Compares an exposure of an excluded camera with the confirmed tracks that others see,
-    /// without updating any: returns what [`Step::fittings`] and [`Step::used`] would be.
+    /// without updating any: returns what [`TrackerStep::fittings`] and [`TrackerStep::used`] would be.
     pub(crate) fn compare(
         &self,
         exposure: &Exposure,
@@ -187,7 +187,7 @@ impl Tracker {
     }
 
     /// How targets move.
-    pub(crate) fn motion(&self) -> &Motion {
+    pub(crate) fn motion(&self) -> &TrackMotion {
         &self.motion
     }
 
@@ -229,7 +229,7 @@ impl Tracker {
         exposure: &Exposure,
         known: &KnownCamera,
         cameras: &Cameras,
-    ) -> Step {
+    ) -> TrackerStep {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
         // If all cameras were silent for long, the tracks are overdue for a review and may be lost
@@ -256,12 +256,12 @@ impl Tracker {
         changes.extend(self.review(exposure.time));
         changes.extend(self.merge(exposure.time));
         changes.extend(self.prove(exposure.time, cameras));
-        Step { free, claims, used, fittings, third_differences, unassigned, changes }
+        TrackerStep { free, claims, used, fittings, third_differences, unassigned, changes }
     }
 
     /// The cameras' mean offsets from confirmed targets, by target, for those whose comparison is
     /// due.
-    pub(crate) fn draws(&mut self) -> Vec<Vec<Sample>> {
+    pub(crate) fn draws(&mut self) -> Vec<Vec<ScaleSample>> {
         let sure = self.tracks.values_mut().filter(|track| track.is_confirmed() && track.is_held());
         sure.map(Track::draw).filter(|samples| samples.len() >= 2).collect()
     }
@@ -289,7 +289,7 @@ impl Tracker {
         known: &KnownCamera,
         owners: &mut [Option<TrackId>],
     ) {
-        let context = Context {
+        let context = ReacquisitionContext {
             exposure,
             known,
             motion: &self.motion,

@@ -100,7 +100,7 @@ impl fmt::Display for WhyNothing {
 
 /// Result of one comparison.
 #[derive(Clone, Copy, Debug)]
-enum Shown {
+enum ComparisonResult {
     /// One of the cameras saw nothing.
     Nothing,
     Lines(Passing),
@@ -108,7 +108,7 @@ enum Shown {
 
 /// What one camera has seen lately.
 #[derive(Clone, Debug)]
-struct Seen {
+struct LatelySeen {
     time: Timestamp,
     lines: Vec<TimedLine>,
     /// Since when and until when each of its image tracks has been there.
@@ -117,9 +117,9 @@ struct Seen {
 
 /// Two cameras' last comparisons.
 #[derive(Clone, Debug)]
-struct Pair {
+struct PairComparisons {
     time: Timestamp,
-    shown: VecDeque<Shown>,
+    shown: VecDeque<ComparisonResult>,
 }
 
 /// Compares cameras while nothing is found.
@@ -127,8 +127,8 @@ struct Pair {
 pub(crate) struct Unmet {
     passings: Passings,
     max_range_m: f64,
-    seen: BTreeMap<CameraName, Seen>,
-    pairs: BTreeMap<[CameraName; 2], Pair>,
+    seen: BTreeMap<CameraName, LatelySeen>,
+    pairs: BTreeMap<[CameraName; 2], PairComparisons>,
     /// Since when there has been no track.
     since: Option<Timestamp>,
     /// When a conclusion was drawn last.
@@ -173,14 +173,14 @@ impl Unmet {
         for (other, seen) in others {
             let mut names = [exposure.camera.clone(), other.clone()];
             names.sort();
-            let fresh = Pair { time: now, shown: VecDeque::new() };
+            let fresh = PairComparisons { time: now, shown: VecDeque::new() };
             let is_new = !self.pairs.contains_key(&names);
             let pair = self.pairs.entry(names).or_insert(fresh);
             if !is_new && now.seconds_since(pair.time) < INTERVAL_S {
                 continue;
             }
             let shown = compared(&lines, &seen.lines, &self.passings);
-            if let Shown::Lines(passing) = shown {
+            if let ComparisonResult::Lines(passing) = shown {
                 counted.push(counter(passing));
             }
             pair.time = now;
@@ -210,7 +210,7 @@ impl Unmet {
     /// lines.
     fn note(&mut self, exposure: &Exposure) -> Vec<TimedLine> {
         let now = exposure.time;
-        let nothing = || Seen { time: now, lines: Vec::new(), since: BTreeMap::new() };
+        let nothing = || LatelySeen { time: now, lines: Vec::new(), since: BTreeMap::new() };
         let seen = self.seen.entry(exposure.camera.clone()).or_insert_with(nothing);
         seen.since.retain(|_, (_, last)| now.seconds_since(*last) <= SOMETHING_S);
         let mut lines = Vec::new();
@@ -234,23 +234,23 @@ impl Unmet {
     /// What most comparisons of the cameras that see something have shown, and the two cameras that
     /// show it most clearly.
     fn conclusion(&self) -> Option<WhyNothing> {
-        let both = |pair: &Pair| {
-            pair.shown.iter().filter(|shown| matches!(shown, Shown::Lines(_))).count()
+        let both = |pair: &PairComparisons| {
+            pair.shown.iter().filter(|shown| matches!(shown, ComparisonResult::Lines(_))).count()
         };
         let steady = self.pairs.iter().filter(|(_, pair)| {
             pair.shown.len() * 2 >= REMEMBERED
                 && both(pair) as f64 >= LEAST_SHARE * pair.shown.len() as f64
         });
-        let steady: Vec<(&[CameraName; 2], &Pair)> = steady.collect();
+        let steady: Vec<(&[CameraName; 2], &PairComparisons)> = steady.collect();
         let kind = |passing: Passing| match passing {
             Passing::Nowhere => 0,
             Passing::Apart { .. } => 1,
             Passing::Close => 2,
         };
-        let count = |pair: &Pair, wanted: usize| {
+        let count = |pair: &PairComparisons, wanted: usize| {
             let lines = pair.shown.iter();
             lines
-                .filter(|shown| matches!(shown, Shown::Lines(passing) if kind(*passing) == wanted))
+                .filter(|shown| matches!(shown, ComparisonResult::Lines(passing) if kind(*passing) == wanted))
                 .count()
         };
         let total = |wanted| steady.iter().map(|(_, pair)| count(pair, wanted)).sum::<usize>();
@@ -274,7 +274,7 @@ fn counter(passing: Passing) -> &'static str {
 }
 
 /// What the two closest lines of two cameras do.
-fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> Shown {
+fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> ComparisonResult {
     let all = one.iter().flat_map(|first| other.iter().map(|second| passings.of(first, second)));
     let closeness = |passing: &Passing| match passing {
         Passing::Close => f64::NEG_INFINITY,
@@ -282,13 +282,13 @@ fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> Show
         Passing::Nowhere => f64::INFINITY,
     };
     let closest = all.min_by(|a, b| closeness(a).total_cmp(&closeness(b)));
-    closest.map_or(Shown::Nothing, Shown::Lines)
+    closest.map_or(ComparisonResult::Nothing, ComparisonResult::Lines)
 }
 
 /// The median distance at which two cameras' lines miss each other, m.
-fn median_miss(pair: &Pair) -> Option<f64> {
-    let miss = |shown: &Shown| match shown {
-        Shown::Lines(Passing::Apart { by_m }) => Some(*by_m),
+fn median_miss(pair: &PairComparisons) -> Option<f64> {
+    let miss = |shown: &ComparisonResult| match shown {
+        ComparisonResult::Lines(Passing::Apart { by_m }) => Some(*by_m),
         _ => None,
     };
     let mut misses: Vec<f64> = pair.shown.iter().filter_map(miss).collect();

@@ -1,5 +1,5 @@
 //! The measurement update of one state by one bearing: an iterated extended Kalman update in the
-//! coordinates of [`RangeChart`]. The camera's shared errors are considered (Schmidt) and not part
+//! coordinates of [`StateChart`]. The camera's shared errors are considered (Schmidt) and not part
 //! of the state; what the bearing tells of them is returned separately ([`Told`]).
 //!
 //! Notation: P is the state's covariance, H the bearing's Jacobian by the state, s the camera's
@@ -13,7 +13,7 @@ use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, SightLine};
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix6, Matrix6x2, Point3, Vector2, Vector6};
 
-use crate::range_chart::Chart;
+use crate::range_chart::StateChart;
 use crate::uncertainty::{CameraUncertainty, SharedErrors, SharedTies, Shifts};
 
 /// Most rounds of the iterated update: with a range known to a factor of three it takes four or
@@ -113,8 +113,8 @@ pub(crate) fn updated(
 ) -> Option<Updated> {
     let Measured { line, camera, errors } = *measured;
     let chart = match seen_from {
-        Some(origin) => Chart::by_range(origin, prior)?,
-        None => Chart::cartesian(prior),
+        Some(origin) => StateChart::by_range(origin, prior)?,
+        None => StateChart::cartesian(prior),
     };
     // P and X in the chart's coordinates, whose origin is the prior mean.
     let (covariance, ties) = chart.expressed(&prior.covariance, &errors.ties);

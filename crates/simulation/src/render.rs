@@ -27,7 +27,7 @@ pub struct RenderedFrame {
 
 /// A target as it appears in an image.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Appearance {
+pub(crate) struct RenderedTarget {
     /// Where its centre is at the start and the end of the exposure, px.
     pub(crate) from: [f64; 2],
     pub(crate) to: [f64; 2],
@@ -47,7 +47,7 @@ fn silhouette(u: f64, v: f64) -> bool {
 }
 
 /// Darkens an image where a target is.
-pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &Appearance) {
+pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &RenderedTarget) {
     let half = target.span / 2.0;
     let soft = target.blur.max(0.3);
     let reach = half + 3.0 * soft + 1.0;
@@ -68,7 +68,7 @@ pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &Appe
 }
 
 /// Share of a pixel that the smeared, blurred silhouette covers.
-fn cover(x: usize, y: usize, half: f64, soft: f64, target: &Appearance) -> f64 {
+fn cover(x: usize, y: usize, half: f64, soft: f64, target: &RenderedTarget) -> f64 {
     // The blur as a 3x3 quadrature of the Gaussian: nodes at 0 and +-sqrt(3) sigma.
     const NODES: [(f64, f64); 3] =
         [(-1.732_050_8, 1.0 / 6.0), (0.0, 2.0 / 3.0), (1.732_050_8, 1.0 / 6.0)];
@@ -101,7 +101,7 @@ mod tests {
     fn a_targets_centre_of_darkness_is_its_centre() {
         let (width, height) = (60, 50);
         let mut image = vec![200.0_f32; width * height];
-        let target = Appearance { from: [30.3, 24.6], to: [30.3, 24.6], span: 14.0, blur: 0.7 };
+        let target = RenderedTarget { from: [30.3, 24.6], to: [30.3, 24.6], span: 14.0, blur: 0.7 };
         draw(&mut image, width, height, &target);
         let (mut sum, mut x, mut y) = (0.0, 0.0, 0.0);
         for (index, value) in image.iter().enumerate() {
@@ -125,7 +125,7 @@ mod tests {
             &mut image,
             20,
             20,
-            &Appearance { from: [-50.0, 5.0], to: [-50.0, 5.0], span: 10.0, blur: 1.0 },
+            &RenderedTarget { from: [-50.0, 5.0], to: [-50.0, 5.0], span: 10.0, blur: 1.0 },
         );
         assert!(image.iter().all(|v| *v == 100.0));
     }

@@ -5,7 +5,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use crate::render::{Appearance, draw};
+use crate::render::{RenderedTarget, draw};
 use crate::sky::{Panorama, sky};
 use crate::{RenderedFrame, Scene, SceneCamera, SceneError, SceneTarget, SimulatedMount};
 
@@ -179,7 +179,7 @@ impl SimulatedCamera {
 
     /// How a target appears in the image at a time; `None` before it exists, or if it is behind the
     /// camera.
-    fn appearance(&self, camera: &Camera, target: &SceneTarget, t: f64) -> Option<Appearance> {
+    fn appearance(&self, camera: &Camera, target: &SceneTarget, t: f64) -> Option<RenderedTarget> {
         if t < target.appears_s {
             return None;
         }
@@ -189,7 +189,7 @@ impl SimulatedCamera {
             Some([pixel.x(), pixel.y()])
         };
         let range = (target.path.state(t).0 - camera.pose().position()).norm();
-        Some(Appearance {
+        Some(RenderedTarget {
             from: place(t - half)?,
             to: place(t + half)?,
             span: target.span_m * self.description.focal_px / range,

@@ -9,7 +9,7 @@ use crossfix_correlation::{Plane, Resampler, View};
 
 use crate::ImagePoint;
 use crate::crop::replace_invalid;
-use crate::scene::Picture;
+use crate::scene::ScenePicture;
 
 /// Standard deviation of the change in contrast of an unchanged scene, in contrasts of the
 /// reference: from registration and compression. With half of it textured scenes count as targets,
@@ -43,7 +43,7 @@ const LEAST_PIXELS: f64 = 4.0;
 
 /// The reference's place now, compared with that in a picture of the scene without the target.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Arrival {
+pub(crate) struct SceneMatch {
     /// Contrast of the reference in its place now, and in the picture, as multiples of its own.
     now: f64,
     before: f64,
@@ -58,14 +58,14 @@ pub(crate) struct Arrival {
 
 /// Memory for the comparison.
 #[derive(Debug, Default)]
-pub(crate) struct Comparison {
+pub(crate) struct PlaceComparison {
     now: Plane,
     before: Plane,
 }
 
 /// A reference in a place of an image, with the variance of the image's noise.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Placed<'a> {
+pub(crate) struct PlacedReference<'a> {
     pub(crate) reference: &'a Plane,
     /// Energy of the reference, its mean removed.
     pub(crate) energy: f64,
@@ -73,7 +73,7 @@ pub(crate) struct Placed<'a> {
     pub(crate) noise: f64,
 }
 
-impl Arrival {
+impl SceneMatch {
     /// Log-likelihood ratio that the target has come there, against that what is there now was
     /// there before; `usual` is the contrast that the target has otherwise.
     ///
@@ -102,9 +102,14 @@ impl Arrival {
     }
 }
 
-impl Comparison {
+impl PlaceComparison {
     /// Samples the image at the reference's place, for the comparisons to come.
-    pub(crate) fn take(&mut self, image: &Plane, placed: Placed<'_>, resampler: &mut Resampler) {
+    pub(crate) fn take(
+        &mut self,
+        image: &Plane,
+        placed: PlacedReference<'_>,
+        resampler: &mut Resampler,
+    ) {
         self.now.reshape(placed.reference.width(), placed.reference.height());
         let ImagePoint { x, y } = placed.place;
         resampler.resample(image, View { x, y, scale: 1.0, turn_rad: 0.0 }, &mut self.now);
@@ -116,13 +121,13 @@ impl Comparison {
     /// outside the picture.
     pub(crate) fn with(
         &mut self,
-        picture: &Picture,
+        picture: &ScenePicture,
         then: ImagePoint,
         seen: Option<ImagePoint>,
-        placed: Placed<'_>,
+        placed: PlacedReference<'_>,
         resampler: &mut Resampler,
-    ) -> Option<Arrival> {
-        let Placed { reference, energy, noise, .. } = placed;
+    ) -> Option<SceneMatch> {
+        let PlacedReference { reference, energy, noise, .. } = placed;
         if !picture.holds(then) {
             return None;
         }
@@ -138,7 +143,7 @@ impl Comparison {
         let covered = |at: usize, side: usize, then: f64, seen: f64| {
             (then + at as f64 - (side as f64 - 1.0) / 2.0 - seen).abs() <= side as f64 / 2.0 + 1.0
         };
-        let mut sums = Sums::default();
+        let mut sums = PixelSums::default();
         for y in 0..height {
             let row_covered = seen.is_some_and(|seen| covered(y, height, then.y, seen.y));
             let above = self.before.row(y.saturating_sub(1));
@@ -160,7 +165,7 @@ impl Comparison {
 
 /// Sums over the pixels that count.
 #[derive(Clone, Copy, Debug, Default)]
-struct Sums {
+struct PixelSums {
     pixels: f64,
     reference: f64,
     now: f64,
@@ -174,7 +179,7 @@ struct Sums {
     slope_squared: f64,
 }
 
-impl Sums {
+impl PixelSums {
     fn add(&mut self, reference: f32, now: f32, before: f32, slope_squared: f32) {
         let [reference, now, before] = [reference, now, before].map(f64::from);
         self.pixels += 1.0;
@@ -205,7 +210,7 @@ impl Sums {
         (now - 2.0 * lighter * both + lighter * lighter * before).max(0.0)
     }
 
-    fn arrival(self, whole: f64, noise: f64) -> Option<Arrival> {
+    fn arrival(self, whole: f64, noise: f64) -> Option<SceneMatch> {
         let n = self.pixels;
         if n < LEAST_PIXELS {
             return None;
@@ -221,7 +226,7 @@ impl Sums {
         let slope = (self.slope_squared / n - 4.0 * noise).max(0.0);
         let unchanged =
             (2.0 * noise + slope * REGISTERED_PX.powi(2)).max(f64::from(f32::MIN_POSITIVE));
-        Some(Arrival {
+        Some(SceneMatch {
             now: contrast(self.reference_now, self.now),
             before: contrast(self.reference_before, self.before),
             variance: noise / energy,

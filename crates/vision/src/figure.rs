@@ -48,14 +48,14 @@ const MOST_OFF: f64 = 0.15;
 
 /// A connected part of a window: its corners, the middle of its weights, and their sum.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Region {
+pub(crate) struct ConnectedRegion {
     low: [usize; 2],
     high: [usize; 2],
     middle: [f64; 2],
     weight: f64,
 }
 
-impl Region {
+impl ConnectedRegion {
     /// Its box in the image, with sides of at least `least`; `corner` is the place of the window's
     /// first pixel in the image.
     ///
@@ -82,7 +82,12 @@ fn threshold(top: f32, spread: f32) -> f32 {
 ///
 /// `off` is by how much each pixel differs from the ground, whose standard deviation is `spread`;
 /// `gap` is the least gap, px.
-pub(crate) fn figure(off: &Plane, seed: [usize; 2], spread: f32, mut gap: usize) -> Option<Region> {
+pub(crate) fn figure(
+    off: &Plane,
+    seed: [usize; 2],
+    spread: f32,
+    mut gap: usize,
+) -> Option<ConnectedRegion> {
     let threshold = threshold(off.row(seed[1])[seed[0]], spread);
     loop {
         let region = connected(off, seed, gap, threshold)?;
@@ -97,7 +102,7 @@ pub(crate) fn figure(off: &Plane, seed: [usize; 2], spread: f32, mut gap: usize)
 
 /// What is above a threshold and connected with a place, over gaps of up to `gap` pixels; `None` if
 /// it reaches the window's border.
-fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Option<Region> {
+fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Option<ConnectedRegion> {
     let (width, height) = (off.width(), off.height());
     let weight = |level: &f32| if *level >= threshold { *level } else { 0.0 };
     let mut weights: Vec<f32> = off.samples().iter().map(weight).collect();
@@ -122,7 +127,7 @@ fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Optio
             }
         }
     }
-    (sum > 0.0).then(|| Region {
+    (sum > 0.0).then(|| ConnectedRegion {
         low,
         high,
         middle: moments.map(|moment| moment / sum),

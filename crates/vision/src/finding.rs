@@ -5,9 +5,9 @@ use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
 
 use crate::config::Algorithm;
-use crate::detector::{Detector, Found, Known};
+use crate::detector::{Detector, Found, KnownTarget};
 use crate::figure::meant;
-use crate::frame::{Frame, Step};
+use crate::frame::{NewImage, TargetStep};
 use crate::tracker::{Followed, Follower, Origin, box_of, describe};
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
@@ -82,7 +82,7 @@ impl ImageTracker {
         *id = if is_candidate { number - 1 } else { number + 1 };
         let id = ImageTrackId(number);
         let target = Follower::new(image, place, &mut self.scratch, &self.config);
-        let step = Step { measured: None, score: 1.0, certainty: 1.0, nis: None };
+        let step = TargetStep { measured: None, score: 1.0, certainty: 1.0, nis: None };
         self.tracks.push(describe(id, &target, TrackPhase::Tentative, step));
         self.followed.push(Followed {
             id,
@@ -188,18 +188,18 @@ impl ImageTracker {
         // A lost target is no longer where it is guessed to be: it may be found there, and
         // something else too.
         let seen = self.followed.iter().filter(|followed| !followed.target.is_searching());
-        let known = seen.map(|followed| Known {
+        let known = seen.map(|followed| KnownTarget {
             id: followed.id,
             place: box_of(&followed.target),
             is_watched: followed.has_moved(),
         });
         // A target to be has no number yet: this one is nobody's.
-        let given = given.iter().map(|place| Known {
+        let given = given.iter().map(|place| KnownTarget {
             id: ImageTrackId(u64::MAX),
             place: *place,
             is_watched: false,
         });
-        let known: Vec<Known> = known.chain(given).collect();
+        let known: Vec<KnownTarget> = known.chain(given).collect();
         let findings = detector.step(image, interval, turned, &known);
         self.followed.retain(|followed| !findings.scene.contains(&followed.id));
         self.tracks.retain(|track| !findings.scene.contains(&track.id));
@@ -215,7 +215,7 @@ impl ImageTracker {
         time: Timestamp,
         interval: f64,
     ) -> bool {
-        let frame = Frame {
+        let frame = NewImage {
             image,
             interval,
             snapshot: None,

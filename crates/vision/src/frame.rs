@@ -3,7 +3,7 @@
 use crossfix_correlation::Plane;
 use nalgebra::Matrix2;
 
-use crate::scene::Scene;
+use crate::scene::SceneMemory;
 use crate::{ImagePoint, TrackerConfig};
 
 /// The frame interval that shares per frame refer to, s.
@@ -11,14 +11,14 @@ pub(crate) const FRAME_INTERVAL: f64 = 1.0 / 30.0;
 
 /// The next image, and what goes with it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Frame<'a> {
+pub(crate) struct NewImage<'a> {
     pub(crate) image: &'a Plane,
     /// Time since the image before, s.
     pub(crate) interval: f64,
     /// A picture of a moment ago, in which every target was seen.
     pub(crate) snapshot: Option<&'a Plane>,
     /// What the scene looked like lately.
-    pub(crate) scene: &'a Scene,
+    pub(crate) scene: &'a SceneMemory,
     /// Shift of everything in the image since the scene was looked at last, as the camera turned,
     /// px.
     pub(crate) scene_moved: [f64; 2],
@@ -28,7 +28,7 @@ pub(crate) struct Frame<'a> {
     pub(crate) config: &'a TrackerConfig,
 }
 
-impl Frame<'_> {
+impl NewImage<'_> {
     /// Columns and rows of the image.
     pub(crate) fn sides(&self) -> [usize; 2] {
         [self.image.width(), self.image.height()]
@@ -46,7 +46,7 @@ pub struct Measurement {
 
 /// Result of one step of one target.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Step {
+pub(crate) struct TargetStep {
     /// The measured place, if the target was seen.
     pub(crate) measured: Option<Measurement>,
     /// The correlation at the best place.
@@ -57,7 +57,7 @@ pub(crate) struct Step {
     pub(crate) nis: Option<f64>,
 }
 
-impl Step {
+impl TargetStep {
     /// Result if the target was not seen; the best place has this correlation.
     pub(crate) fn unseen(score: f64) -> Self {
         Self { measured: None, score, certainty: 0.0, nis: None }

@@ -7,12 +7,12 @@ use crossfix_filter::Gate;
 use crate::TrackerConfig;
 use crate::config::GateRule;
 use crate::crop::crop;
-use crate::frame::Frame;
+use crate::frame::NewImage;
 use crate::likelihood::log_ratios;
-use crate::motion::Motion;
-use crate::posterior::{Posterior, Prior};
+use crate::motion::ImageMotion;
+use crate::posterior::{PlacePrior, Posterior};
 use crate::scratch::Scratch;
-use crate::state::State;
+use crate::state::BeliefState;
 
 /// Correlation time of being hidden, s: about how long a target stays hidden once it is. A blur is
 /// shorter, a cloud longer. When it was chosen, of ten seeds' sequences 3.8 % of the frames were
@@ -35,7 +35,7 @@ pub(crate) struct Region {
 }
 
 impl Region {
-    pub(crate) fn about(state: &State, half: [usize; 2]) -> Self {
+    pub(crate) fn about(state: &BeliefState, half: [usize; 2]) -> Self {
         let expected = state.motion.found();
         let reference = state.appearance.working.image();
         let reference = [reference.width(), reference.height()];
@@ -45,7 +45,7 @@ impl Region {
     }
 }
 
-impl State {
+impl BeliefState {
     /// Half sides of the gate (Herasymenko 2021, section 1; Lytvynets 2020, eq. 5.12): how far from
     /// the prediction the reference is placed.
     pub(crate) fn half_gate(&self, image: &Plane, config: &TrackerConfig) -> [usize; 2] {
@@ -99,11 +99,11 @@ impl State {
     /// probability that the target was hidden in the image before.
     pub(crate) fn prior(
         &self,
-        motion: &Motion,
+        motion: &ImageMotion,
         hidden: f64,
         region: Region,
-        frame: Frame<'_>,
-    ) -> Prior {
+        frame: NewImage<'_>,
+    ) -> PlacePrior {
         let config = frame.config;
         let expected = motion.found();
         let stays_hidden = (-frame.interval / HIDDEN_S).exp();
@@ -111,7 +111,7 @@ impl State {
         // one.
         let often = config.visible_probability;
         let visible = often + (1.0 - hidden - often) * stays_hidden;
-        Prior {
+        PlacePrior {
             centre: [0, 1].map(|i| expected[i].position - region.origin[i]),
             variance: [0, 1].map(|i| expected[i].variance + config.prediction_floor_px.powi(2)),
             anywhere: self.anywhere(config),
@@ -124,11 +124,11 @@ impl State {
     /// and the log likelihood ratios in `scratch.ratios`.
     pub(crate) fn posterior(
         &self,
-        frame: Frame<'_>,
+        frame: NewImage<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) -> Posterior {
-        let Frame { image, config, .. } = frame;
+        let NewImage { image, config, .. } = frame;
         let Region { origin, corner, sides, .. } = region;
         crop(image, corner, sides, &mut scratch.gate);
         scratch.correlator.statistics(

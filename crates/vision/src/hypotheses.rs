@@ -7,12 +7,12 @@
 use crossfix_filter::AxisMeasurement;
 
 use crate::ImagePoint;
-use crate::frame::Frame;
+use crate::frame::NewImage;
 use crate::gate::Region;
-use crate::motion::Motion;
+use crate::motion::ImageMotion;
 use crate::posterior::Posterior;
 use crate::scratch::Scratch;
-use crate::state::State;
+use crate::state::BeliefState;
 
 /// Certainty of the best place below which the other places are kept too.
 pub(crate) const DOUBT: f64 = 0.9;
@@ -37,18 +37,18 @@ const LONGEST_S: f64 = 2.0;
 
 /// A place where the target may be, with the filters of its motion.
 #[derive(Clone, Debug)]
-pub(crate) struct Hypothesis {
+pub(crate) struct PlaceHypothesis {
     pub(crate) weight: f64,
-    pub(crate) motion: Motion,
+    pub(crate) motion: ImageMotion,
     /// Probability that the target was hidden in the image before.
     pub(crate) hidden: f64,
     /// The placement of the map on which it has been seen in this image; `None` if it was not seen.
     pub(crate) peak: Option<[usize; 2]>,
 }
 
-impl Hypothesis {
+impl PlaceHypothesis {
     /// The hypothesis of a target whose place is not in doubt yet.
-    fn of(state: &State) -> Self {
+    fn of(state: &BeliefState) -> Self {
         Self { weight: 1.0, motion: state.motion.clone(), hidden: state.hidden, peak: None }
     }
 
@@ -75,13 +75,13 @@ impl Hypothesis {
 
 /// The hypotheses of a target; empty while its place is sure.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Hypotheses {
-    all: Vec<Hypothesis>,
+pub(crate) struct PlaceHypotheses {
+    all: Vec<PlaceHypothesis>,
     /// How long no place has been sure, s.
     doubted_s: f64,
 }
 
-impl Hypotheses {
+impl PlaceHypotheses {
     pub(crate) fn clear(&mut self) {
         self.all.clear();
         self.doubted_s = 0.0;
@@ -106,7 +106,7 @@ impl Hypotheses {
         self.all.is_empty()
     }
 
-    pub(crate) fn predict(&mut self, frame: Frame<'_>) {
+    pub(crate) fn predict(&mut self, frame: NewImage<'_>) {
         for hypothesis in &mut self.all {
             hypothesis.motion.predict(frame.interval, frame.sides());
         }
@@ -114,9 +114,9 @@ impl Hypotheses {
 
     /// Starts with the target's present state as the only hypothesis, unless there are some
     /// already.
-    pub(crate) fn begin(&mut self, state: &State) {
+    pub(crate) fn begin(&mut self, state: &BeliefState) {
         if self.all.is_empty() {
-            self.all.push(Hypothesis::of(state));
+            self.all.push(PlaceHypothesis::of(state));
         }
     }
 
@@ -134,7 +134,7 @@ impl Hypotheses {
     pub(crate) fn spread(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
         [0, 1].map(|i| {
-            let off = |h: &Hypothesis| h.weight * (h.at()[i] - at[i]).powi(2);
+            let off = |h: &PlaceHypothesis| h.weight * (h.at()[i] - at[i]).powi(2);
             self.all.iter().map(off).sum()
         })
     }
@@ -143,13 +143,13 @@ impl Hypotheses {
     pub(crate) fn reach(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
         [0, 1].map(|i| {
-            let far = |hypothesis: &Hypothesis| (hypothesis.at()[i] - at[i]).abs();
+            let far = |hypothesis: &PlaceHypothesis| (hypothesis.at()[i] - at[i]).abs();
             self.all.iter().map(far).fold(0.0, f64::max)
         })
     }
 
     /// The likeliest hypothesis.
-    pub(crate) fn best(&self) -> Option<&Hypothesis> {
+    pub(crate) fn best(&self) -> Option<&PlaceHypothesis> {
         self.all.first()
     }
 
@@ -160,7 +160,7 @@ impl Hypotheses {
 
     /// Total weight of the hypotheses that have been seen near a placement in this image.
     pub(crate) fn share_near(&self, [column, row]: [usize; 2], near: [usize; 2]) -> f64 {
-        let here = |h: &&Hypothesis| {
+        let here = |h: &&PlaceHypothesis| {
             h.peak.is_some_and(|[x, y]| x.abs_diff(column) <= near[0] && y.abs_diff(row) <= near[1])
         };
         self.all.iter().filter(here).map(|h| h.weight).sum()
@@ -170,8 +170,8 @@ impl Hypotheses {
     /// `scratch.ratios`.
     pub(crate) fn advance(
         &mut self,
-        state: &State,
-        frame: Frame<'_>,
+        state: &BeliefState,
+        frame: NewImage<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) {
@@ -182,11 +182,11 @@ impl Hypotheses {
     /// weight leads to that one place.
     pub(crate) fn one_place(
         &self,
-        state: &State,
-        frame: Frame<'_>,
+        state: &BeliefState,
+        frame: NewImage<'_>,
         region: Region,
         scratch: &mut Scratch,
-    ) -> Option<(Motion, Posterior)> {
+    ) -> Option<(ImageMotion, Posterior)> {
         let near = state.peak_half();
         let mut ways: Vec<(f64, usize, Posterior)> = Vec::with_capacity(self.all.len());
         let mut all = 0.0;
@@ -214,11 +214,11 @@ impl Hypotheses {
     /// seen, and one per peak of its posterior.
     fn branches(
         &self,
-        state: &State,
-        frame: Frame<'_>,
+        state: &BeliefState,
+        frame: NewImage<'_>,
         region: Region,
         scratch: &mut Scratch,
-    ) -> Vec<Hypothesis> {
+    ) -> Vec<PlaceHypothesis> {
         let config = frame.config;
         let mut branches = Vec::with_capacity(self.all.len() * (MOST_PEAKS + 1));
         for hypothesis in &self.all {
@@ -226,7 +226,7 @@ impl Hypotheses {
             let posterior = scratch.map.of(&scratch.ratios, &prior);
             // Bayes' rule: the prior weight times the likelihood of the image.
             let weight = hypothesis.weight * posterior.evidence;
-            branches.push(Hypothesis {
+            branches.push(PlaceHypothesis {
                 weight: weight * posterior.unseen,
                 motion: hypothesis.motion.clone(),
                 hidden: 1.0,
@@ -254,7 +254,7 @@ impl Hypotheses {
                 } else {
                     motion.restart(at, config.search_velocity_sd_px);
                 }
-                branches.push(Hypothesis {
+                branches.push(PlaceHypothesis {
                     weight: weight * share,
                     motion,
                     hidden: 0.0,
@@ -268,9 +268,9 @@ impl Hypotheses {
 
 /// Merges and prunes hypotheses: the heaviest first, with weights that sum to 1 before those below
 /// `LEAST` are dropped.
-fn kept(mut all: Vec<Hypothesis>) -> Vec<Hypothesis> {
+fn kept(mut all: Vec<PlaceHypothesis>) -> Vec<PlaceHypothesis> {
     all.sort_by(|one, other| other.weight.total_cmp(&one.weight));
-    let mut kept: Vec<Hypothesis> = Vec::with_capacity(MOST);
+    let mut kept: Vec<PlaceHypothesis> = Vec::with_capacity(MOST);
     for hypothesis in all {
         let known = kept.iter().position(|known| known.is_like(&hypothesis));
         match known {

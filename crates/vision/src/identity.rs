@@ -2,13 +2,13 @@
 //! which was there before.
 
 use crate::ImagePoint;
-use crate::arrival::Placed;
+use crate::arrival::PlacedReference;
 use crate::fit::TargetFit;
-use crate::frame::{FRAME_INTERVAL, Frame};
-use crate::motion::Motion;
-use crate::scene::{Picture, Scene};
+use crate::frame::{FRAME_INTERVAL, NewImage};
+use crate::motion::ImageMotion;
+use crate::scene::{SceneMemory, ScenePicture};
 use crate::scratch::Scratch;
-use crate::state::State;
+use crate::state::BeliefState;
 
 /// How long a target that was found again must have been seen before it is believed, s: until then
 /// a mistake costs what is known of where it went, and nothing is learnt of it.
@@ -54,7 +54,7 @@ pub(crate) struct Identity {
 /// State of a target before it was found again.
 #[derive(Clone, Debug)]
 struct Probation {
-    motion: Motion,
+    motion: ImageMotion,
     unseen_s: f64,
     last_seen: ImagePoint,
     missed: u32,
@@ -89,7 +89,7 @@ impl Identity {
     }
 
     /// Notes its place in the scene in the image before, if it was seen for sure.
-    pub(crate) fn note_last_place(&mut self, state: &State, frame: Frame<'_>) {
+    pub(crate) fn note_last_place(&mut self, state: &BeliefState, frame: NewImage<'_>) {
         if state.unseen_s > 0.0 || self.probation.is_some() {
             return;
         }
@@ -99,7 +99,7 @@ impl Identity {
     }
 
     /// Notes its place when a picture of the scene was taken, if it was seen.
-    pub(crate) fn note_picture(&mut self, state: &State, number: u64) {
+    pub(crate) fn note_picture(&mut self, state: &BeliefState, number: u64) {
         // While it is in doubt, its place is not known.
         if state.unseen_s > 0.0 {
             return;
@@ -123,12 +123,12 @@ impl Identity {
     /// now. A target that hovered, and is where it was, may be in all of the pictures.
     pub(crate) fn arrival_log_ratio(
         &self,
-        state: &State,
-        frame: Frame<'_>,
+        state: &BeliefState,
+        frame: NewImage<'_>,
         place: ImagePoint,
         scratch: &mut Scratch,
     ) -> f64 {
-        let placed = Placed {
+        let placed = PlacedReference {
             reference: state.appearance.working.image(),
             energy: f64::from(state.appearance.energy()),
             place,
@@ -140,7 +140,7 @@ impl Identity {
         comparison.take(frame.image, placed, &mut buffers.resampler);
         let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
         let speed = self.speed_px_s.max(self.least_speed(state, frame, place));
-        let mut against = |picture: &Picture, then: ImagePoint| {
+        let mut against = |picture: &ScenePicture, then: ImagePoint| {
             let seen = self.in_pictures.iter().find(|(number, _)| *number == picture.number());
             let seen = seen.map(|(_, seen)| *seen);
             let was_lost =
@@ -162,7 +162,7 @@ impl Identity {
     }
 
     /// Least speed with which a lost target can have come to a place by now, px/s.
-    fn least_speed(&self, state: &State, frame: Frame<'_>, place: ImagePoint) -> f64 {
+    fn least_speed(&self, state: &BeliefState, frame: NewImage<'_>, place: ImagePoint) -> f64 {
         let Some([x, y]) = self.last_in_scene else { return 0.0 };
         let turned = frame.scene.turned();
         let lost_s = self.probation.as_ref().map_or(state.unseen_s, |probation| probation.unseen_s);
@@ -174,8 +174,8 @@ impl Identity {
     /// whether that stands out as the target does.
     pub(crate) fn doubt(
         &mut self,
-        state: &State,
-        frame: Frame<'_>,
+        state: &BeliefState,
+        frame: NewImage<'_>,
         fit: TargetFit,
         scratch: &mut Scratch,
     ) -> f64 {
@@ -194,7 +194,7 @@ impl Identity {
     }
 
     /// Begins a probation: a search has found something.
-    pub(crate) fn begin_probation(&mut self, state: &State, scene: &Scene) {
+    pub(crate) fn begin_probation(&mut self, state: &BeliefState, scene: &SceneMemory) {
         self.probation = Some(Probation {
             motion: state.motion.clone(),
             unseen_s: state.unseen_s,
@@ -207,7 +207,7 @@ impl Identity {
     }
 
     /// Predicts what was known before it was found again to the time of the next image.
-    pub(crate) fn predict_probation(&mut self, frame: Frame<'_>) {
+    pub(crate) fn predict_probation(&mut self, frame: NewImage<'_>) {
         if let Some(probation) = &mut self.probation {
             probation.motion.predict(frame.interval, frame.sides());
             probation.unseen_s += frame.interval;
@@ -216,7 +216,7 @@ impl Identity {
 
     /// Ends a probation: what was found again is lost again, so it was something else, and what was
     /// known before is restored. False if there was no probation.
-    pub(crate) fn fail_probation(&mut self, state: &mut State) -> bool {
+    pub(crate) fn fail_probation(&mut self, state: &mut BeliefState) -> bool {
         let Some(before) = self.probation.take() else { return false };
         (state.motion, state.unseen_s, state.last_seen) =
             (before.motion, before.unseen_s, before.last_seen);
@@ -238,7 +238,7 @@ impl Identity {
 
 /// Log-likelihood ratio of a contrast being the target's, whose usual one is known, against it
 /// being the largest of so many placements' in noise.
-fn above_noise_log_ratio(state: &State, contrast: f64, placements: f64) -> f64 {
+fn above_noise_log_ratio(state: &BeliefState, contrast: f64, placements: f64) -> f64 {
     let deviation =
         f64::from(state.noise / state.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();
     let clear = f64::from(state.appearance.clear_share());

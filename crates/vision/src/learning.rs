@@ -2,9 +2,9 @@
 
 use crate::ImagePoint;
 use crate::fit::TargetFit;
-use crate::frame::{FRAME_INTERVAL, Frame};
+use crate::frame::{FRAME_INTERVAL, NewImage};
 use crate::scratch::Scratch;
-use crate::state::{SEEN, State};
+use crate::state::{BeliefState, SEEN};
 
 /// Averaging time of the usual contrast, s: longer than a cloud takes it away.
 const USUAL_S: f64 = 3.0;
@@ -28,18 +28,18 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
     ((value - low) / (high - low)).clamp(0.0, 1.0)
 }
 
-impl State {
+impl BeliefState {
     /// Learns contrast, size, direction and appearance from an image, the more the surer the target
     /// was seen.
     pub(crate) fn learn(
         &mut self,
-        frame: Frame<'_>,
+        frame: NewImage<'_>,
         place: ImagePoint,
         fit: TargetFit,
         certainty: f64,
         scratch: &mut Scratch,
     ) {
-        let Frame { image, interval, .. } = frame;
+        let NewImage { image, interval, .. } = frame;
         if certainty < LEAST_CERTAINTY[0] {
             return;
         }

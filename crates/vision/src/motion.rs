@@ -59,16 +59,16 @@ const FOUND_AT: RowVector3<f64> = RowVector3::new(1.0, 0.0, 1.0);
 
 /// Position, velocity and offset on one axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Axis {
+struct AxisMotion {
     mean: Vector3<f64>,
     covariance: Matrix3<f64>,
 }
 
 /// Interacting multiple model filter of a target's motion in the image.
 #[derive(Clone, Debug)]
-pub(crate) struct Motion {
+pub(crate) struct ImageMotion {
     /// State of both axes under each motion model.
-    ways: [[Axis; 2]; WAYS],
+    ways: [[AxisMotion; 2]; WAYS],
     weights: [f64; WAYS],
     /// Variance of the measurement noise over the expected one, as matched to the innovations.
     noise_factor: f64,
@@ -77,7 +77,7 @@ pub(crate) struct Motion {
     /// Interval of the last prediction, s.
     interval: f64,
     /// Mean and covariance of the mixture of all models.
-    all: [Axis; 2],
+    all: [AxisMotion; 2],
     /// Kalman gain of the update since the last prediction, per model and axis: change of the
     /// states per pixel between measured and predicted. And the variances of that measurement.
     gains: [[Vector3<f64>; 2]; WAYS],
@@ -94,7 +94,7 @@ pub(crate) struct Motion {
 
 /// Measurement of where the reference is found in one image, as parts of a mixture.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Evidence {
+pub(crate) struct PlaceEvidence {
     /// Probability that the reference is at the measured place, and that measurement.
     pub(crate) near: f64,
     pub(crate) at: [AxisMeasurement; 2],
@@ -103,14 +103,14 @@ pub(crate) struct Evidence {
     pub(crate) elsewhere_at: [AxisMeasurement; 2],
 }
 
-impl Evidence {
+impl PlaceEvidence {
     /// Evidence of a measurement that is not doubted.
     pub(crate) fn of(at: [AxisMeasurement; 2]) -> Self {
         Self { near: 1.0, at, elsewhere: 0.0, elsewhere_at: at }
     }
 }
 
-impl Axis {
+impl AxisMotion {
     fn found(&self) -> AxisMeasurement {
         let position = self.mean[POSITION] + self.mean[OFFSET];
         AxisMeasurement {
@@ -160,7 +160,7 @@ impl Axis {
     }
 }
 
-impl Motion {
+impl ImageMotion {
     /// Motion of a target at rest, whose given place, on both axes, has become the middle of its
     /// reference. The error of the given place is in the position and with the opposite sign in the
     /// offset, so that it cancels in where the reference is found.
@@ -173,7 +173,7 @@ impl Motion {
             let off = Vector3::new(1.0, 0.0, -1.0);
             let mut covariance = off * off.transpose() * variance;
             covariance[(VELOCITY, VELOCITY)] = velocity_sd.powi(2);
-            Axis { mean: Vector3::new(position, 0.0, 0.0), covariance }
+            AxisMotion { mean: Vector3::new(position, 0.0, 0.0), covariance }
         });
         Self {
             ways: [all; WAYS],
@@ -301,7 +301,7 @@ impl Motion {
                 let apart = way[i].mean - mean;
                 covariance += (way[i].covariance + apart * apart.transpose()) * weight;
             }
-            self.all[i] = Axis { mean, covariance };
+            self.all[i] = AxisMotion { mean, covariance };
         }
     }
 
@@ -383,8 +383,8 @@ impl Motion {
 
     /// Updates with what an image says of where the reference is found: on each axis that becomes
     /// the mixture of near, elsewhere and not seen, replaced by its mean and variance.
-    pub(crate) fn update(&mut self, evidence: &Evidence) {
-        let Evidence { near, at, elsewhere, elsewhere_at } = *evidence;
+    pub(crate) fn update(&mut self, evidence: &PlaceEvidence) {
+        let PlaceEvidence { near, at, elsewhere, elsewhere_at } = *evidence;
         self.measured = at.map(|at| at.variance);
         // L_w = N(z; H x_w, H P_w H' + R), the likelihood of the measurement under each model, as a
         // logarithm so that none underflows.

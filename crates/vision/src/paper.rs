@@ -7,7 +7,7 @@ use crossfix_filter::{AxisFilter, AxisMeasurement, Innovation};
 use nalgebra::Matrix2;
 
 use crate::crop::replace_invalid;
-use crate::frame::{Measurement, Step};
+use crate::frame::{Measurement, TargetStep};
 use crate::reference::Adaptation;
 use crate::scratch::Scratch;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
@@ -74,7 +74,7 @@ impl PaperTarget {
         place: ImagePoint,
         interval: f64,
         config: &TrackerConfig,
-    ) -> Step {
+    ) -> TargetStep {
         let at = |position| Self::at(position, config);
         if let Some(axes) = &mut self.axes {
             predict(axes, interval, image);
@@ -95,9 +95,9 @@ impl PaperTarget {
         score: f64,
         nis: Option<f64>,
         config: &TrackerConfig,
-    ) -> Step {
+    ) -> TargetStep {
         let covariance = Matrix2::identity() * config.paper.measurement_sd_px.powi(2);
-        Step { measured: Some(Measurement { place, covariance }), score, certainty: 1.0, nis }
+        TargetStep { measured: Some(Measurement { place, covariance }), score, certainty: 1.0, nis }
     }
 
     pub(crate) fn step(
@@ -106,7 +106,7 @@ impl PaperTarget {
         interval: f64,
         scratch: &mut Scratch,
         config: &TrackerConfig,
-    ) -> Step {
+    ) -> TargetStep {
         if let Some(axes) = &mut self.axes {
             predict(axes, interval, image);
         }

@@ -6,7 +6,7 @@ use crate::lanes;
 /// Prior of the place, before the image is looked at: a Gaussian per axis, and a share that may be
 /// anywhere in the gate.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Prior {
+pub(crate) struct PlacePrior {
     /// Column and row of the prediction in the map of placements (positions of the reference in the
     /// gate).
     pub(crate) centre: [f64; 2],
@@ -22,7 +22,7 @@ pub(crate) struct Prior {
 
 /// A part of the posterior: its mass, and its mean and variance per axis, in placements.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Part {
+pub(crate) struct PosteriorPart {
     pub(crate) mass: f64,
     pub(crate) mean: [f64; 2],
     pub(crate) variance: [f64; 2],
@@ -34,8 +34,8 @@ pub(crate) struct Part {
 pub(crate) struct Posterior {
     /// Column and row of the peak.
     pub(crate) peak: [usize; 2],
-    pub(crate) near: Part,
-    pub(crate) elsewhere: Part,
+    pub(crate) near: PosteriorPart,
+    pub(crate) elsewhere: PosteriorPart,
     pub(crate) unseen: f64,
     /// Likelihood of the image under this prior, in a unit that is the same for all priors of one
     /// map.
@@ -46,7 +46,7 @@ impl Posterior {
     /// The posterior if what is near the peak is the target with probability `probability` only; the
     /// rest of that mass goes to `unseen`.
     pub(crate) fn doubted(&self, probability: f64) -> Self {
-        let near = Part { mass: self.near.mass * probability, ..self.near };
+        let near = PosteriorPart { mass: self.near.mass * probability, ..self.near };
         Self { near, unseen: self.unseen + self.near.mass - near.mass, ..*self }
     }
 }
@@ -83,7 +83,7 @@ fn gaussian(count: usize, centre: f64, variance: f64, out: &mut Vec<f32>) {
 }
 
 impl PosteriorMap {
-    pub(crate) fn of(&mut self, log_ratios: &Plane, prior: &Prior) -> Posterior {
+    pub(crate) fn of(&mut self, log_ratios: &Plane, prior: &PlacePrior) -> Posterior {
         let (width, height) = (log_ratios.width(), log_ratios.height());
         gaussian(width, prior.centre[0], prior.variance[0], &mut self.columns);
         gaussian(height, prior.centre[1], prior.variance[1], &mut self.rows);
@@ -119,9 +119,10 @@ impl PosteriorMap {
         let background = ((all - inside) / away).max(f64::from(-largest).exp());
         // P(unseen) : P(seen) = (1 - visible) background : visible mass.
         let unseen = (1.0 - prior.visible) / prior.visible * background;
-        let rest = Part { mass: (total.mass - near.mass).max(0.0), ..without(total, near) };
+        let rest =
+            PosteriorPart { mass: (total.mass - near.mass).max(0.0), ..without(total, near) };
         let sum = total.mass + unseen;
-        let share = |part: Part| Part { mass: part.mass / sum, ..part };
+        let share = |part: PosteriorPart| PosteriorPart { mass: part.mass / sum, ..part };
         Posterior {
             peak,
             near: share(near),
@@ -142,7 +143,7 @@ impl PosteriorMap {
 
     /// Removes the largest peak from the map of the last posterior, and returns its placement and
     /// its part, with the mass in units of the evidence.
-    pub(crate) fn take_peak(&mut self, near: [usize; 2]) -> ([usize; 2], Part) {
+    pub(crate) fn take_peak(&mut self, near: [usize; 2]) -> ([usize; 2], PosteriorPart) {
         let peak = self.peak();
         let [columns, rows] = around(peak, near, [self.weights.width(), self.weights.height()]);
         let part = self.moments([columns.clone(), rows.clone()]);
@@ -155,7 +156,7 @@ impl PosteriorMap {
     }
 
     /// Mass, mean and variance of the weights of a part of the map.
-    fn moments(&self, [columns, rows]: [std::ops::Range<usize>; 2]) -> Part {
+    fn moments(&self, [columns, rows]: [std::ops::Range<usize>; 2]) -> PosteriorPart {
         let (mut mass, mut first, mut second) = (0.0, [0.0; 2], [0.0; 2]);
         for y in rows {
             for x in columns.clone() {
@@ -170,7 +171,7 @@ impl PosteriorMap {
         part(mass, first, second)
     }
 
-    fn total(&self) -> Part {
+    fn total(&self) -> PosteriorPart {
         let (mut mass, mut first, mut second) = (0.0, [0.0; 2], [0.0; 2]);
         for (y, sums) in self.sums.iter().enumerate() {
             let (y, weight) = (y as f64, f64::from(sums.weight));
@@ -184,22 +185,22 @@ impl PosteriorMap {
     }
 }
 
-fn part(mass: f64, first: [f64; 2], second: [f64; 2]) -> Part {
+fn part(mass: f64, first: [f64; 2], second: [f64; 2]) -> PosteriorPart {
     let mass_or_one = if mass > 0.0 { mass } else { 1.0 };
     let mean = first.map(|f| f / mass_or_one);
     // Each placement stands for a whole pixel, whose uniform distribution has the variance 1/12.
     let variance =
         [0, 1].map(|i| (second[i] / mass_or_one - mean[i] * mean[i]).max(0.0) + 1.0 / 12.0);
-    Part { mass, mean, variance }
+    PosteriorPart { mass, mean, variance }
 }
 
 /// The rest of a whole when a part is taken out, by the difference of their moments.
-fn without(whole: Part, taken: Part) -> Part {
+fn without(whole: PosteriorPart, taken: PosteriorPart) -> PosteriorPart {
     let rest = whole.mass - taken.mass;
     if rest <= 1e-6 * whole.mass {
         return taken;
     }
-    let sums = |p: Part| {
+    let sums = |p: PosteriorPart| {
         let second = [0, 1].map(|i| (p.variance[i] - 1.0 / 12.0 + p.mean[i] * p.mean[i]) * p.mass);
         (p.mean.map(|m| m * p.mass), second)
     };
@@ -271,8 +272,14 @@ fn row_sums(ratios: &[f32], weights: &[f32]) -> RowSums {
 mod tests {
     use super::*;
 
-    fn prior(anywhere: f64) -> Prior {
-        Prior { centre: [10.0, 8.0], variance: [4.0, 4.0], anywhere, visible: 0.95, near: [2, 2] }
+    fn prior(anywhere: f64) -> PlacePrior {
+        PlacePrior {
+            centre: [10.0, 8.0],
+            variance: [4.0, 4.0],
+            anywhere,
+            visible: 0.95,
+            near: [2, 2],
+        }
     }
 
     #[test]

@@ -31,7 +31,7 @@ pub(crate) fn overlap(side: usize, by: isize) -> std::ops::Range<usize> {
 
 /// Normal equations of one step of the registration, with the change of brightness taken out.
 #[derive(Clone, Copy, Debug, Default)]
-struct Normal {
+struct RegistrationEquations {
     weight: f32,
     slope: [f32; 2],
     off: f32,
@@ -39,7 +39,7 @@ struct Normal {
     slope_off: [f32; 2],
 }
 
-impl Normal {
+impl RegistrationEquations {
     fn add(&mut self, [gx, gy]: [f32; 2], off: f32) {
         // Cauchy's robust weight: 1 / (1 + (off / c)^2).
         let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
@@ -99,8 +99,8 @@ fn each_off(
 }
 
 /// The normal equations of two pictures at a shift, pixels.
-fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> Normal {
-    let mut normal = Normal::default();
+fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> RegistrationEquations {
+    let mut normal = RegistrationEquations::default();
     each_off(now, then, shift, |_, slope, off| normal.add(slope, off));
     normal
 }
@@ -196,7 +196,7 @@ pub(crate) fn registered(now: &Plane, then: &Plane, first: [f32; 2]) -> Option<[
     }
     let mut shift = first;
     let mut normal = normal_at(now, then, shift);
-    let brighter = |normal: &Normal| normal.off / normal.weight.max(1.0);
+    let brighter = |normal: &RegistrationEquations| normal.off / normal.weight.max(1.0);
     let before = brighter(&normal);
     for _ in 0..STEPS {
         let [x, y] = normal.step()?;

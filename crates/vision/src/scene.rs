@@ -42,7 +42,7 @@ const USUAL_SHARE: f32 = 0.05;
 
 /// A picture of the scene.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Picture {
+pub(crate) struct ScenePicture {
     image: Plane,
     coarse: Plane,
     age_s: f64,
@@ -51,7 +51,7 @@ pub(crate) struct Picture {
     shift: [f64; 2],
 }
 
-impl Picture {
+impl ScenePicture {
     /// How long ago it was taken, s.
     pub(crate) fn age_s(&self) -> f64 {
         self.age_s
@@ -85,7 +85,7 @@ const GLANCED: usize = 4;
 /// One row of some blocks, by which a jerk of the camera is noticed at a tenth of the cost of a
 /// registration.
 #[derive(Debug, Default)]
-struct Glance {
+struct RowGlance {
     /// Mean of one row of each of these blocks, in the last image.
     means: Vec<f32>,
     changes: Vec<f32>,
@@ -93,7 +93,7 @@ struct Glance {
     usual: f32,
 }
 
-impl Glance {
+impl RowGlance {
     /// Whether most of the image has changed since the image before, by more than noise.
     fn is_another(&mut self, image: &Plane) -> bool {
         let Self { means, changes, usual } = self;
@@ -123,9 +123,9 @@ impl Glance {
 
 /// The last seconds' pictures.
 #[derive(Debug, Default)]
-pub(crate) struct Scene {
+pub(crate) struct SceneMemory {
     /// The newest first.
-    pictures: Vec<Picture>,
+    pictures: Vec<ScenePicture>,
     coarse: Plane,
     between: Plane,
     sums: Vec<f32>,
@@ -133,14 +133,14 @@ pub(crate) struct Scene {
     /// Whether the camera had not turned when it was registered last, and the time since then, s.
     is_still: bool,
     unlooked_s: f64,
-    glance: Glance,
+    glance: RowGlance,
     /// Shift of the scene since the beginning, when the newest picture was taken, px.
     turned: [f64; 2],
 }
 
-impl Scene {
+impl SceneMemory {
     /// The pictures, the newest first.
-    pub(crate) fn pictures(&self) -> impl Iterator<Item = &Picture> {
+    pub(crate) fn pictures(&self) -> impl Iterator<Item = &ScenePicture> {
         self.pictures.iter()
     }
 
@@ -159,7 +159,7 @@ impl Scene {
     pub(crate) fn clear(&mut self) {
         self.turned = self.turned();
         self.pictures.clear();
-        (self.glance, self.is_still) = (Glance::default(), false);
+        (self.glance, self.is_still) = (RowGlance::default(), false);
     }
 
     /// Finds how the camera has turned by registering the image with the newest picture; against
@@ -207,7 +207,7 @@ impl Scene {
         }
         self.turned = self.turned();
         let mut kept = if self.pictures.len() < PICTURES {
-            Picture::default()
+            ScenePicture::default()
         } else {
             self.pictures.remove(self.pictures.len() - 1)
         };
@@ -224,14 +224,14 @@ impl Scene {
     /// then, 0 where that is unknown. False without a picture of about that age.
     pub(crate) fn change(&self, image: &Plane, change: &mut Plane) -> bool {
         let of_age =
-            |picture: &&Picture| (CHANGED_S / 2.0..=CHANGED_S * 2.0).contains(&picture.age_s);
-        let off = |picture: &Picture| (picture.age_s - CHANGED_S).abs();
+            |picture: &&ScenePicture| (CHANGED_S / 2.0..=CHANGED_S * 2.0).contains(&picture.age_s);
+        let off = |picture: &ScenePicture| (picture.age_s - CHANGED_S).abs();
         let nearest = self
             .pictures
             .iter()
             .filter(of_age)
             .min_by(|one, other| off(one).total_cmp(&off(other)));
-        let Some(Picture { image: before, shift, .. }) = nearest else { return false };
+        let Some(ScenePicture { image: before, shift, .. }) = nearest else { return false };
         let (width, height) = (image.width(), image.height());
         // The older picture is interpolated linearly between four pixels.
         let whole = shift.map(f64::floor);
@@ -353,7 +353,7 @@ mod tests {
     fn a_turn_of_the_camera_is_found_in_noise_and_adds_up() {
         // In the noise of a tenth of all levels a turn has to be a pixel or two before it is told.
         for (noise, most) in [(0.5, 0.6), (25.0, 2.0)] {
-            let mut scene = Scene::default();
+            let mut scene = SceneMemory::default();
             let turned = |frame: u32| [0.8 * f64::from(frame), -0.5 * f64::from(frame)];
             for frame in 0..60 {
                 let image = clouds(turned(frame), noise, u64::from(frame));
@@ -373,7 +373,7 @@ mod tests {
 
     #[test]
     fn a_clear_sky_tells_no_turn() {
-        let mut scene = Scene::default();
+        let mut scene = SceneMemory::default();
         let mut rng = ChaCha8Rng::seed_from_u64(9);
         let normal = Normal::new(0.0, 40.0).unwrap();
         for _ in 0..90 {
@@ -388,7 +388,7 @@ mod tests {
 
     #[test]
     fn a_target_that_moves_over_a_still_sky_is_no_turn() {
-        let mut scene = Scene::default();
+        let mut scene = SceneMemory::default();
         let mut rng = ChaCha8Rng::seed_from_u64(10);
         let normal = Normal::new(0.0, 2.0).unwrap();
         for frame in 0..60 {
@@ -409,7 +409,7 @@ mod tests {
 
     #[test]
     fn what_has_changed_is_what_has_come_and_what_has_gone() {
-        let mut scene = Scene::default();
+        let mut scene = SceneMemory::default();
         let with_blob = |mut image: Plane, column: usize| {
             for y in 100..106 {
                 image.row_mut(y)[column..column + 8].fill(250.0);
@@ -437,7 +437,7 @@ mod tests {
 
     #[test]
     fn pictures_reach_back_for_seconds_and_are_few() {
-        let mut scene = Scene::default();
+        let mut scene = SceneMemory::default();
         for frame in 0..600 {
             let image = clouds([0.0; 2], 1.0, frame);
             scene.register(&image, 1.0 / 30.0);

@@ -3,7 +3,7 @@
 use crossfix_correlation::{Correlator, Plane, Statistics};
 
 use crate::appearance::AppearanceScratch;
-use crate::arrival::Comparison;
+use crate::arrival::PlaceComparison;
 use crate::noise::NoiseMeter;
 use crate::posterior::PosteriorMap;
 
@@ -18,7 +18,7 @@ pub(crate) struct Scratch {
     pub(crate) ratios: Plane,
     pub(crate) search: SearchScratch,
     pub(crate) map: PosteriorMap,
-    pub(crate) comparison: Comparison,
+    pub(crate) comparison: PlaceComparison,
 }
 
 /// Buffers of a search.

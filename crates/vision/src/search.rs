@@ -7,13 +7,13 @@ use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
 use crate::TrackerConfig;
 use crate::crop::{crop, replace_invalid};
 use crate::fit::TargetFit;
-use crate::frame::Frame;
+use crate::frame::NewImage;
 use crate::identity::Identity;
 use crate::likelihood::log_ratios;
 use crate::noise::{OF_MEDIAN, median};
 use crate::scratch::{Scratch, SearchScratch};
 use crate::search_memory::{Background, SearchMemory};
-use crate::state::State;
+use crate::state::BeliefState;
 
 /// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few
 /// milliseconds then; with 8 it takes three times as long and finds no more, with 3 it finds what
@@ -38,7 +38,7 @@ const NOISE_OF_CHANGE: f32 = 1.6;
 
 /// The best place of a search.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Found {
+pub(crate) struct SearchResult {
     pub(crate) fit: Option<TargetFit>,
     pub(crate) accepted: bool,
 }
@@ -64,7 +64,11 @@ fn coarsened(from: &Plane, side: usize, to: &mut Plane) {
 }
 
 /// The target's reference on the coarse picture.
-fn coarse_reference(state: &State, coarseness: usize, resampler: &mut Resampler) -> Reference {
+fn coarse_reference(
+    state: &BeliefState,
+    coarseness: usize,
+    resampler: &mut Resampler,
+) -> Reference {
     let working = state.appearance.working.image();
     let side = |length: usize| 2 * (length / (2 * coarseness)) + 1;
     let (width, height) = (side(working.width()), side(working.height()));
@@ -90,7 +94,7 @@ impl Coarse {
     /// picture, into `scratch.ratios`.
     fn ratios(
         &self,
-        state: &State,
+        state: &BeliefState,
         noise: f32,
         picture: &Plane,
         [columns, rows]: &[Range<usize>; 2],
@@ -112,14 +116,14 @@ impl Coarse {
     }
 
     /// How much the part that has been correlated last looks like the reference.
-    fn likeness(&self, scratch: &mut Scratch) -> Likeness {
+    fn likeness(&self, scratch: &mut Scratch) -> ReferenceLikeness {
         let covariances = scratch.statistics.covariance.samples();
         let SearchScratch { contrasts, .. } = &mut scratch.search;
         contrasts.clear();
         contrasts.extend(covariances.iter().map(|covariance| covariance.abs()));
         let deviation =
             OF_MEDIAN * median(contrasts) / self.reference.variance().max(f32::MIN_POSITIVE);
-        Likeness {
+        ReferenceLikeness {
             deviation: f64::from(deviation).max(LEAST_LIKENESS),
             places: contrasts.len().max(1) as f64,
         }
@@ -129,13 +133,13 @@ impl Coarse {
 /// How much the picture that is searched looks like a target: the contrasts with which the target's
 /// reference is found at its places.
 #[derive(Clone, Copy, Debug)]
-struct Likeness {
+struct ReferenceLikeness {
     /// Standard deviation of the contrasts about zero.
     deviation: f64,
     places: f64,
 }
 
-impl Likeness {
+impl ReferenceLikeness {
     /// Log-likelihood ratio of a contrast being the target's, whose usual one is known, against it
     /// being the largest of the scene's places.
     fn log_ratio(self, contrast: f64, usual: f64, contrast_sd: f64) -> f64 {
@@ -158,7 +162,7 @@ struct Searched<'a> {
 
 /// A lost target, with what is kept for its search.
 pub(crate) struct Sought<'a> {
-    pub(crate) state: &'a mut State,
+    pub(crate) state: &'a mut BeliefState,
     pub(crate) identity: &'a Identity,
     pub(crate) memory: &'a mut SearchMemory,
 }
@@ -167,7 +171,7 @@ impl Sought<'_> {
     /// Searches for it: by turns in what has changed, where no cloud is, and in the image, where it
     /// may hover; and by turns with its last appearance and its first, which it keeps if it is
     /// found by that.
-    pub(crate) fn find(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Found {
+    pub(crate) fn find(&mut self, frame: NewImage<'_>, scratch: &mut Scratch) -> SearchResult {
         let mut change = std::mem::take(&mut scratch.search.change);
         let searches = self.memory.searches;
         let is_change = searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
@@ -191,10 +195,10 @@ impl Sought<'_> {
 
     fn find_in(
         &mut self,
-        frame: Frame<'_>,
+        frame: NewImage<'_>,
         searched: Searched<'_>,
         scratch: &mut Scratch,
-    ) -> Found {
+    ) -> SearchResult {
         let config = frame.config;
         let Searched { picture: image, noise, is_change } = searched;
         let state = &mut *self.state;
@@ -202,13 +206,13 @@ impl Sought<'_> {
         let sides = [working.width(), working.height()];
         let coarseness = (sides[0].min(sides[1]) / COARSE_SIDE).clamp(1, MOST_COARSE);
         if image.width() < 2 * coarseness || image.height() < 2 * coarseness {
-            return Found { fit: None, accepted: false };
+            return SearchResult { fit: None, accepted: false };
         }
         let coarse = Coarse {
             reference: coarse_reference(state, coarseness, &mut scratch.buffers.resampler),
             coarseness,
         };
-        let area = Area::new(state, image, &coarse, is_change, config);
+        let area = SearchArea::new(state, image, &coarse, is_change, config);
         if !is_change {
             remember_background(self.memory, state, frame, &coarse, scratch);
         }
@@ -234,12 +238,12 @@ impl Sought<'_> {
             && best.margin > MARGIN
             && likeness.log_ratio(peak.contrast, usual, config.contrast_sd) > ABOVE_CHANCE
             && self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0;
-        Found { fit: Some(fit), accepted }
+        SearchResult { fit: Some(fit), accepted }
     }
 }
 
 /// The best placement of a reference near a place.
-pub(crate) struct Peak {
+pub(crate) struct BestPlacement {
     pub(crate) column: usize,
     pub(crate) row: usize,
     pub(crate) log_ratio: f32,
@@ -251,7 +255,7 @@ pub(crate) struct Peak {
     pub(crate) sides: [usize; 2],
 }
 
-impl State {
+impl BeliefState {
     /// The best placement of the target's reference within `reach` of a place, px, at full
     /// resolution. Leaves the part of the image that the placements cover in `scratch.gate`.
     pub(crate) fn best_near(
@@ -262,7 +266,7 @@ impl State {
         reach: f64,
         scratch: &mut Scratch,
         config: &TrackerConfig,
-    ) -> Peak {
+    ) -> BestPlacement {
         let working = self.appearance.working.image();
         let reference = [working.width(), working.height()];
         let origin = place.map(|at| at.round() - reach.ceil());
@@ -280,7 +284,7 @@ impl State {
         let peak = fine.peak();
         let covariance = scratch.statistics.covariance.row(peak.row)[peak.column];
         let contrast = f64::from(covariance * pixels / energy.max(1e-12)).max(0.0);
-        Peak {
+        BestPlacement {
             column: peak.column,
             row: peak.row,
             log_ratio: peak.score,
@@ -305,8 +309,8 @@ impl State {
 /// Notes the log likelihood ratios of the scene itself, from the snapshot, once per loss.
 fn remember_background(
     memory: &mut SearchMemory,
-    state: &State,
-    frame: Frame<'_>,
+    state: &BeliefState,
+    frame: NewImage<'_>,
     coarse: &Coarse,
     scratch: &mut Scratch,
 ) {
@@ -336,7 +340,7 @@ struct Best {
 }
 
 /// The area in which a target is searched for.
-struct Area {
+struct SearchArea {
     /// Columns and rows of the coarse picture.
     ranges: [Range<usize>; 2],
     /// The predicted place, and the half sides of the area about it, px of the full picture.
@@ -349,9 +353,9 @@ struct Area {
     is_change: bool,
 }
 
-impl Area {
+impl SearchArea {
     fn new(
-        state: &State,
+        state: &BeliefState,
         image: &Plane,
         coarse: &Coarse,
         is_change: bool,
@@ -376,7 +380,7 @@ impl Area {
 
     fn best_place(
         &self,
-        state: &State,
+        state: &BeliefState,
         memory: &SearchMemory,
         scratch: &mut Scratch,
         config: &TrackerConfig,

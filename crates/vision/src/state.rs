@@ -9,9 +9,9 @@ use crossfix_filter::AxisMeasurement;
 
 use crate::appearance::Appearance;
 use crate::crop::crop;
-use crate::frame::{FRAME_INTERVAL, Frame};
+use crate::frame::{FRAME_INTERVAL, NewImage};
 use crate::likelihood::Expectation;
-use crate::motion::Motion;
+use crate::motion::ImageMotion;
 use crate::scratch::Scratch;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
@@ -28,9 +28,9 @@ const MOST_SHAPE_VARIANCE: [f64; 2] = [0.09, 0.25];
 
 /// State of the belief about one target.
 #[derive(Clone, Debug)]
-pub(crate) struct State {
+pub(crate) struct BeliefState {
     pub(crate) appearance: Appearance,
-    pub(crate) motion: Motion,
+    pub(crate) motion: ImageMotion,
     /// Probability that the target was hidden in the last image.
     pub(crate) hidden: f64,
     /// Variance of the image's noise.
@@ -52,7 +52,7 @@ pub(crate) struct State {
     pub(crate) in_snapshot: Option<ImagePoint>,
 }
 
-impl State {
+impl BeliefState {
     /// State of a target that somebody shows: the box and a margin become the reference (Lytvynets
     /// 2020, object model).
     pub(crate) fn new(
@@ -70,7 +70,11 @@ impl State {
         let given = [centre.x, centre.y].map(|position| AxisMeasurement { position, variance });
         Self {
             appearance: Appearance::new(image, place, noise, config, &mut scratch.buffers),
-            motion: Motion::at_rest(given, config.start_velocity_sd_px, config.acceleration_sd_px),
+            motion: ImageMotion::at_rest(
+                given,
+                config.start_velocity_sd_px,
+                config.acceleration_sd_px,
+            ),
             hidden: 0.0,
             noise,
             contrast: 1.0,
@@ -108,7 +112,7 @@ impl State {
     }
 
     /// Predicts to the time of the next image.
-    pub(crate) fn predict(&mut self, frame: Frame<'_>) {
+    pub(crate) fn predict(&mut self, frame: NewImage<'_>) {
         self.motion.predict(frame.interval, frame.sides());
         self.unseen_s += frame.interval;
         let frames = frame.interval / FRAME_INTERVAL;

@@ -4,9 +4,9 @@ use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
 use crate::detector::Detector;
-use crate::frame::{Frame, Measurement, Step};
+use crate::frame::{Measurement, NewImage, TargetStep};
 use crate::paper::PaperTarget;
-use crate::scene::Scene;
+use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
 use crate::target::Target;
 use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
@@ -101,7 +101,12 @@ impl Follower {
         }
     }
 
-    fn step(&mut self, frame: Frame<'_>, cue: Option<ImagePoint>, scratch: &mut Scratch) -> Step {
+    fn step(
+        &mut self,
+        frame: NewImage<'_>,
+        cue: Option<ImagePoint>,
+        scratch: &mut Scratch,
+    ) -> TargetStep {
         match (self, cue) {
             (Self::Posterior(target), None) => target.step(frame, scratch),
             (Self::Posterior(target), Some(place)) => target.take_place(frame, place, scratch),
@@ -227,7 +232,7 @@ pub struct ImageTracker {
     pub(crate) config: TrackerConfig,
     pub(crate) scratch: Scratch,
     snapshot: Option<BackgroundSnapshot>,
-    pub(crate) scene: Scene,
+    pub(crate) scene: SceneMemory,
     pub(crate) detector: Option<Detector>,
     pub(crate) waiting: Vec<PixelBox>,
     pub(crate) followed: Vec<Followed>,
@@ -253,7 +258,7 @@ impl ImageTracker {
             config,
             scratch: Scratch::default(),
             snapshot: None,
-            scene: Scene::default(),
+            scene: SceneMemory::default(),
             detector,
             waiting: Vec::new(),
             followed: Vec::new(),
@@ -327,7 +332,7 @@ impl ImageTracker {
         }
         let after = self.scene.turned();
         let scene_moved = [0, 1].map(|i| before[i] - after[i]);
-        let frame = Frame {
+        let frame = NewImage {
             image,
             interval,
             snapshot,
@@ -345,7 +350,7 @@ impl ImageTracker {
             .min_by_key(|f| f.searched)
             .map(|f| f.id);
         for followed in &mut self.followed {
-            let frame = Frame { may_search: turn == Some(followed.id), ..frame };
+            let frame = NewImage { may_search: turn == Some(followed.id), ..frame };
             if frame.may_search {
                 followed.searched = Some(time);
             }
@@ -484,7 +489,7 @@ pub(crate) fn describe(
     id: ImageTrackId,
     target: &Follower,
     phase: TrackPhase,
-    step: Step,
+    step: TargetStep,
 ) -> ImageTrack {
     let [width, height] = target.size();
     ImageTrack {

@@ -5,8 +5,8 @@ use super::gauge::Gauge;
 use super::model::{CLOCK, POSE_AND_CLOCK};
 use super::noise::Tails;
 use super::normal::{Covariance, NormalEquations, Solution};
-use super::rows::{Cost, Row, Sink};
-use super::state::{CameraPriors, Flight, Priors, State};
+use super::rows::{Cost, ResidualRow, Sink};
+use super::state::{CameraPriors, Flight, FlightState, Priors};
 use crate::lens;
 
 /// Standard deviations of unknowns of which nothing is known beforehand: wide against anything that
@@ -25,7 +25,7 @@ const READOUT_SHARE: f64 = 0.5;
 struct Linear(NormalEquations);
 
 impl Sink for Linear {
-    fn take(&mut self, rows: &[Row], tails: Tails) {
+    fn take(&mut self, rows: &[ResidualRow], tails: Tails) {
         let weight =
             tails.weight(rows.iter().map(|(_, residual)| residual * residual).sum(), rows.len());
         self.0.add(rows, weight);
@@ -34,15 +34,15 @@ impl Sink for Linear {
 
 /// Everything that the unknowns are weighted by.
 #[derive(Clone, Copy)]
-struct Model<'a> {
+struct AdjustmentModel<'a> {
     flight: Flight<'a>,
     priors: &'a Priors,
     gauge: Option<&'a Gauge>,
 }
 
-impl State {
-    fn all(&self, model: &Model<'_>, sink: &mut impl Sink) {
-        let Model { flight, priors, gauge } = model;
+impl FlightState {
+    fn all(&self, model: &AdjustmentModel<'_>, sink: &mut impl Sink) {
+        let AdjustmentModel { flight, priors, gauge } = model;
         self.jerk_rows(priors, sink);
         self.rest_rows(sink);
         match flight.log {
@@ -125,8 +125,8 @@ pub(super) const SETTLED: f64 = 0.01;
 pub(super) const NEARLY_SETTLED: f64 = 1.0;
 
 /// The state of least cost, and its covariance.
-pub(super) struct Adjusted {
-    pub(super) state: State,
+pub(super) struct AdjustedFlight {
+    pub(super) state: FlightState,
     pub(super) covariance: Covariance,
     pub(super) cost: f64,
 }
@@ -136,13 +136,13 @@ pub(super) struct Adjusted {
 pub(super) fn adjust(
     flight: &Flight<'_>,
     priors: &Priors,
-    start: State,
+    start: FlightState,
     settled: f64,
-) -> Option<Adjusted> {
+) -> Option<AdjustedFlight> {
     let gauge = if flight.log.is_none() { Some(Gauge::of(&start)?) } else { None };
-    let model = Model { flight: *flight, priors, gauge: gauge.as_ref() };
+    let model = AdjustmentModel { flight: *flight, priors, gauge: gauge.as_ref() };
     let seen = start.seen_coefficients(flight);
-    let cost_of_rows = |state: &State| {
+    let cost_of_rows = |state: &FlightState| {
         let mut cost = Cost(0.0);
         state.all(&model, &mut cost);
         cost.0
@@ -177,8 +177,8 @@ pub(super) fn adjust(
 
     // The covariance is of the undamped equations, with the wider prior of the rates.
     let known = Priors { rate_sd: RATE_KNOWN_BY, ..priors.clone() };
-    let solution = linearised(&Model { priors: &known, ..model }, &state).solve(0.0)?;
-    Some(Adjusted { state, covariance: solution.covariance()?, cost })
+    let solution = linearised(&AdjustmentModel { priors: &known, ..model }, &state).solve(0.0)?;
+    Some(AdjustedFlight { state, covariance: solution.covariance()?, cost })
 }
 
 /// Share of each diagonal element that it is enlarged by at first, ...
@@ -189,7 +189,7 @@ const DAMPING_STEP: f64 = 10.0;
 /// ... and its largest value.
 const MOST_DAMPING: f64 = 1e3;
 
-fn linearised(model: &Model<'_>, state: &State) -> NormalEquations {
+fn linearised(model: &AdjustmentModel<'_>, state: &FlightState) -> NormalEquations {
     let order = state.order();
     let mut linear = Linear(NormalEquations::new(order.chain(), order.band(), state.others()));
     state.all(model, &mut linear);

@@ -4,15 +4,15 @@
 use crossfix_geometry::{Pose, turn_between, turn_vector};
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
-use super::model::{CameraLabels, CameraState};
-use super::state::State;
+use super::model::{CameraLabels, CameraUnknowns};
+use super::state::FlightState;
 use super::{linear, triangulation};
 use crate::landmarks::{Landmark, LandmarkError, LandmarkPicture, calibrate_landmarks};
 use crate::lens;
 use crate::survey::{Click, ENOUGH_PLACES, Survey, SurveyedLandmark};
 
 /// Similarity transformation: rotation, scale and shift.
-struct Similarity {
+struct SimilarityTransform {
     rotation: Rotation3<f64>,
     scale: f64,
     from: Point3<f64>,
@@ -20,11 +20,11 @@ struct Similarity {
 }
 
 /// A place of the site as cameras reconstruct it, and as the survey has it.
-type Place = (Point3<f64>, Point3<f64>);
+type CommonPlace = (Point3<f64>, Point3<f64>);
 
 /// What is known in both frames: that of the reconstruction, and that of the survey.
-struct Known {
-    places: Vec<Place>,
+struct KnownPlaces {
+    places: Vec<CommonPlace>,
     rotations: Vec<(Rotation3<f64>, Rotation3<f64>)>,
     /// Why cameras' own landmarks tell no pose.
     untold: Vec<String>,
@@ -36,11 +36,12 @@ struct Known {
 /// # Errors
 /// The survey does not determine the size: what its landmarks lack.
 pub(super) fn to_survey(
-    state: &State,
+    state: &FlightState,
     labels: &[CameraLabels],
     survey: &Survey,
-) -> Result<(State, f64), Vec<String>> {
-    let Known { places, rotations, untold } = Known::of(state, labels, survey).without_wrong();
+) -> Result<(FlightState, f64), Vec<String>> {
+    let KnownPlaces { places, rotations, untold } =
+        KnownPlaces::of(state, labels, survey).without_wrong();
     let scale = size(&places).or_else(|| taped(state, labels, survey)).ok_or(untold)?;
     let (from, to) = if places.is_empty() {
         (state.cameras[0].centre, Point3::origin())
@@ -59,14 +60,18 @@ pub(super) fn to_survey(
         turn(&arms)
     };
     let rotation = rotation.unwrap_or_else(|| about(&arms, upright(&state.cameras)));
-    Ok((Similarity { rotation, scale, from, to }.moved(state), scale))
+    Ok((SimilarityTransform { rotation, scale, from, to }.moved(state), scale))
 }
 
-fn middles(places: &[Place]) -> Place {
+fn middles(places: &[CommonPlace]) -> CommonPlace {
     (middle(places.iter().map(|pair| pair.0)), middle(places.iter().map(|pair| pair.1)))
 }
 
-fn arms(places: &[Place], from: Point3<f64>, to: Point3<f64>) -> Vec<(Vector3<f64>, Vector3<f64>)> {
+fn arms(
+    places: &[CommonPlace],
+    from: Point3<f64>,
+    to: Point3<f64>,
+) -> Vec<(Vector3<f64>, Vector3<f64>)> {
     places.iter().map(|(here, there)| (here - from, there - to)).collect()
 }
 
@@ -79,9 +84,9 @@ const LEAST_FAR: f64 = 0.05;
 /// A pose turned by more than this is wrong, too, rad.
 const FAR_TURNED_RAD: f64 = 0.2;
 
-impl Similarity {
+impl SimilarityTransform {
     /// The similarity that three places determine; `None` where they lie on a line.
-    fn of_three(three: &[Place]) -> Option<Self> {
+    fn of_three(three: &[CommonPlace]) -> Option<Self> {
         let (from, to) = middles(three);
         let rotation = turn(&arms(three, from, to))?;
         Some(Self { rotation, scale: size(three)?, from, to })
@@ -91,12 +96,12 @@ impl Similarity {
         self.to + self.rotation * (place - self.from) * self.scale
     }
 
-    fn misfit(&self, (here, there): &Place) -> f64 {
+    fn misfit(&self, (here, there): &CommonPlace) -> f64 {
         (self.place(*here) - there).norm()
     }
 }
 
-impl Known {
+impl KnownPlaces {
     /// Removes what is not where the rest is (least median of squares: the triple whose similarity
     /// half of all places fit best): one wrong place among four would turn the site over.
     fn without_wrong(mut self) -> Self {
@@ -104,14 +109,14 @@ impl Known {
         if self.places.len() <= ENOUGH_PLACES {
             return self;
         }
-        let tried: Vec<Place> =
+        let tried: Vec<CommonPlace> =
             self.places.iter().step_by(self.places.len().div_ceil(TRIED_PLACES)).copied().collect();
-        let mut best: Option<(f64, Similarity)> = None;
+        let mut best: Option<(f64, SimilarityTransform)> = None;
         for a in 0..tried.len() {
             for b in a + 1..tried.len() {
                 for c in b + 1..tried.len() {
                     let three = [tried[a], tried[b], tried[c]];
-                    let Some(shown) = Similarity::of_three(&three) else { continue };
+                    let Some(shown) = SimilarityTransform::of_three(&three) else { continue };
                     let misfit =
                         linear::median(self.places.iter().map(|place| shown.misfit(place)));
                     if best.as_ref().is_none_or(|(least, _)| misfit < *least) {
@@ -146,7 +151,7 @@ impl Known {
 
     /// Collects cameras' surveyed places and earlier poses, landmarks that two cameras see, and
     /// cameras whose own landmarks tell their pose.
-    fn of(state: &State, labels: &[CameraLabels], survey: &Survey) -> Self {
+    fn of(state: &FlightState, labels: &[CameraLabels], survey: &Survey) -> Self {
         let mut known = Self { places: Vec::new(), rotations: Vec::new(), untold: Vec::new() };
         for (labels, camera) in labels.iter().zip(&state.cameras) {
             if let Some(place) = survey.place(&labels.name) {
@@ -232,7 +237,7 @@ fn size(places: &[(Point3<f64>, Point3<f64>)]) -> Option<f64> {
 }
 
 /// The same from a taped distance.
-fn taped(state: &State, labels: &[CameraLabels], survey: &Survey) -> Option<f64> {
+fn taped(state: &FlightState, labels: &[CameraLabels], survey: &Survey) -> Option<f64> {
     survey.distances.iter().find_map(|distance| {
         let [a, b] = distance.between.each_ref().map(|name| {
             let index = labels.iter().position(|camera| camera.name == *name);
@@ -259,7 +264,7 @@ fn turn(arms: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Rotation3<f64>> {
 }
 
 /// The rotation that makes cameras upright, taking the rows of their images as level.
-fn upright(cameras: &[CameraState]) -> Rotation3<f64> {
+fn upright(cameras: &[CameraUnknowns]) -> Rotation3<f64> {
     let rows = cameras.iter().map(|camera| camera.rotation * Vector3::x());
     let sum: Matrix3<f64> = rows.map(|row| row * row.transpose()).sum();
     // Up is across all rows: the direction of their least spread.
@@ -292,8 +297,8 @@ fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rota
     longest.and_then(tip).map_or(turned, |tip| tip * turned)
 }
 
-impl Similarity {
-    fn moved(&self, state: &State) -> State {
+impl SimilarityTransform {
+    fn moved(&self, state: &FlightState) -> FlightState {
         let place = |place: Point3<f64>| self.place(place);
         let mut moved = state.clone();
         for camera in &mut moved.cameras {

@@ -3,10 +3,10 @@
 use super::align;
 use super::course::Course;
 use super::error::{FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal};
-use super::model::{CameraLabels, CameraState, FlightLog, frame_time, hours};
-use super::pairs::{self, Pair, Sights};
-use super::spline::Spline;
-use super::state::{CameraPriors, Priors, RATE_SD, State};
+use super::model::{CameraLabels, CameraUnknowns, FlightLog, frame_time, hours};
+use super::pairs::{self, CameraPair, Sights};
+use super::spline::TrajectorySpline;
+use super::state::{CameraPriors, FlightState, Priors, RATE_SD};
 use super::would_fit::WouldFit;
 use super::{start, things, triangulation, would_fit};
 use crate::label_noise::LabelNoise;
@@ -46,9 +46,9 @@ const FIRST_NOISE: LabelNoise = LabelNoise { white_px: 0.5, lasting_px: 1.4, las
 const FIRST_WANDER: f64 = 2e-5;
 
 /// The cameras that take part, and the states they begin with.
-pub(super) struct Begun {
+pub(super) struct BegunFlight {
     pub(super) cameras: Vec<CameraLabels>,
-    states: Vec<CameraState>,
+    states: Vec<CameraUnknowns>,
     course: Course,
     /// Number of each camera's labels that are of something other than the target.
     pub(super) of_others: Vec<(CameraName, usize)>,
@@ -56,7 +56,7 @@ pub(super) struct Begun {
     pub(super) refused: Vec<(CameraName, Refusal)>,
 }
 
-impl Begun {
+impl BegunFlight {
     fn new(course: Course) -> Self {
         let (cameras, states) = (Vec::new(), Vec::new());
         Self { cameras, states, course, of_others: Vec::new(), refused: Vec::new() }
@@ -84,7 +84,7 @@ impl Begun {
     pub(super) fn by_pairs(
         cameras: &[CameraLabels],
         survey: &Survey,
-    ) -> Result<(Self, State), FlightError> {
+    ) -> Result<(Self, FlightState), FlightError> {
         let (usable, unusable): (Vec<_>, Vec<_>) =
             cameras.iter().map(|camera| (camera, usable(camera))).partition(|(_, is)| is.is_ok());
         let usable: Vec<&CameraLabels> = usable.into_iter().map(|(camera, _)| camera).collect();
@@ -114,7 +114,7 @@ impl Begun {
         Ok((begun, state))
     }
 
-    fn take(&mut self, camera: &CameraLabels, start: Result<CameraState, Refusal>) {
+    fn take(&mut self, camera: &CameraLabels, start: Result<CameraUnknowns, Refusal>) {
         match start {
             Ok(state) => {
                 self.cameras.push(camera.clone());
@@ -127,7 +127,7 @@ impl Begun {
     /// Puts the cameras into the order that they were given in.
     fn order_as(&mut self, cameras: &[CameraLabels]) {
         let (names, states) = (self.cameras.drain(..), self.states.drain(..));
-        let mut both: Vec<(CameraLabels, CameraState)> = names.zip(states).collect();
+        let mut both: Vec<(CameraLabels, CameraUnknowns)> = names.zip(states).collect();
         both.sort_by_key(|(own, _)| cameras.iter().position(|camera| camera.name == own.name));
         (self.cameras, self.states) = both.into_iter().unzip();
     }
@@ -168,19 +168,19 @@ impl Begun {
     }
 
     /// All unknowns at the start: each camera in its state, the trajectory as the course shows it.
-    pub(super) fn unknowns(&self, has_log: bool) -> State {
+    pub(super) fn unknowns(&self, has_log: bool) -> FlightState {
         let labels = self.cameras.iter().zip(&self.states);
         let times = labels
             .flat_map(|(camera, state)| camera.labels.iter().map(|label| state.time_s(label)));
         let (from, to) = times.fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), time_s| {
             (from.min(time_s), to.max(time_s))
         });
-        let mut way = Spline::over(from - MARGIN_S, to + MARGIN_S);
+        let mut way = TrajectorySpline::over(from - MARGIN_S, to + MARGIN_S);
         self.course.lead(&mut way);
         let mut states = self.states.clone();
         states.iter_mut().for_each(|camera| camera.clock.wander = way.drift());
         let bias = vec![way.drift(); if has_log { 3 } else { 0 }];
-        State { way, cameras: states, bias }
+        FlightState { way, cameras: states, bias }
     }
 
     /// Priors and noise of the first round.
@@ -248,7 +248,7 @@ impl Begun {
 
     /// Sum of all cameras' median misfits to the course, rad.
     fn misfit(&self) -> f64 {
-        let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
+        let of_camera = |(camera, state): (&CameraLabels, &CameraUnknowns)| {
             start::misfit_of(camera, state, &self.course)
         };
         self.cameras.iter().zip(&self.states).map(of_camera).sum()
@@ -269,7 +269,10 @@ fn usable(camera: &CameraLabels) -> Result<(), Refusal> {
 }
 
 /// A camera's start against a course.
-fn placed_against(camera: &CameraLabels, course: &Course) -> Result<(CameraState, f64), Refusal> {
+fn placed_against(
+    camera: &CameraLabels,
+    course: &Course,
+) -> Result<(CameraUnknowns, f64), Refusal> {
     let (state, misfit) = start::find(camera, course, frame_time(camera)).ok_or(Refusal::NoTime)?;
     tracing::debug!(
         "camera `{}` starts at {:.2} with the clock {:.3} s behind, {:.2} mrad off",
@@ -289,9 +292,9 @@ fn placed_against(camera: &CameraLabels, course: &Course) -> Result<(CameraState
 fn proven(
     camera: &CameraLabels,
     course: &Course,
-    state: CameraState,
+    state: CameraUnknowns,
     misfit: f64,
-) -> Result<CameraState, Refusal> {
+) -> Result<CameraUnknowns, Refusal> {
     let mirrored = || start::find(camera, &course.mirrored(), frame_time(camera));
     if misfit > DOUBTED_RAD && mirrored().is_some_and(|(_, other)| other * CLEARLY_BETTER < misfit)
     {
@@ -305,7 +308,7 @@ fn proven(
 fn target_of(
     camera: &CameraLabels,
     course: &Course,
-) -> (CameraLabels, Result<CameraState, Refusal>) {
+) -> (CameraLabels, Result<CameraUnknowns, Refusal>) {
     let started =
         |camera: &CameraLabels| usable(camera).and_then(|()| placed_against(camera, course));
     let start = started(camera);
@@ -330,7 +333,7 @@ fn target_of(
 }
 
 /// Whether a start lies near enough to a course.
-fn fits(misfit: f64, state: &CameraState, course: &Course) -> bool {
+fn fits(misfit: f64, state: &CameraUnknowns, course: &Course) -> bool {
     let of_errors = LOG_DEVIATIONS * course.errors.sd_m.hypot(course.errors.drift_sd_m);
     misfit <= MOST_MISFIT_RAD + of_errors / course.middle_distance(state.centre)
 }
@@ -352,7 +355,7 @@ struct BeginWith<'a> {
     cameras: [&'a CameraLabels; 2],
     /// Rotation, centre, and the time by the first's clock less that by the camera's own, s.
     poses: [(Rotation3<f64>, Point3<f64>, f64); 2],
-    /// As [`Pair::doubt`].
+    /// As [`CameraPair::doubt`].
     doubt: f64,
     /// Whether the poses are those of an earlier calibration.
     is_known: bool,
@@ -360,7 +363,7 @@ struct BeginWith<'a> {
 
 impl<'a> BeginWith<'a> {
     fn found(cameras: [&'a CameraLabels; 2], sights: [&Sights; 2]) -> Vec<Self> {
-        let of_pair = |pair: Pair| Self {
+        let of_pair = |pair: CameraPair| Self {
             cameras,
             poses: [
                 (Rotation3::identity(), Point3::origin(), 0.0),
@@ -389,7 +392,7 @@ impl<'a> BeginWith<'a> {
 
 /// Of the best pairs the one that most cameras fit, and fit best; poses of an earlier calibration
 /// are preferred if they fit about as well.
-fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<Begun, FlightError> {
+fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<BegunFlight, FlightError> {
     let sights: Vec<Sights> = cameras.iter().map(|camera| Sights::of(camera)).collect();
     let (mut found, mut known) = (Vec::new(), Vec::new());
     for first in 0..cameras.len() {
@@ -415,7 +418,7 @@ fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<Begun, Fl
             if way.is_known { ", where they were" } else { "" }
         );
         // Their trajectory is not known yet: the clocks' knots are made with it.
-        let mut begun = Begun::new(Course::nowhere());
+        let mut begun = BegunFlight::new(Course::nowhere());
         for (camera, pose) in way.cameras.into_iter().zip(way.poses) {
             let state = start::state(camera, &begun.course, pose);
             begun.take(camera, Ok(state));
@@ -423,13 +426,13 @@ fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<Begun, Fl
         begun.place_the_rest(cameras, &sights)?;
         Some((begun, way.is_known))
     });
-    let mut begun: Vec<(Begun, bool)> = begun.collect();
+    let mut begun: Vec<(BegunFlight, bool)> = begun.collect();
     begun.sort_by(|(a, _), (b, _)| {
         let fewer = b.cameras.len().cmp(&a.cameras.len());
         fewer.then_with(|| a.misfit().total_cmp(&b.misfit()))
     });
     let ((best, _), others) = begun.split_first().ok_or(FlightError::NoPair)?;
-    let as_good = |(other, is_known): &(Begun, bool)| *is_known && other.fits_as(best);
+    let as_good = |(other, is_known): &(BegunFlight, bool)| *is_known && other.fits_as(best);
     if let Some(index) = begun.iter().position(as_good) {
         return Ok(begun.swap_remove(index).0);
     }

@@ -5,9 +5,9 @@ use nalgebra::{DMatrix, DVector, Dyn, OMatrix, U3, Vector2};
 
 use super::model::POSE_AND_CLOCK;
 use super::noise::Tails;
-use super::rows::{Row, Sink, UNSEEN};
-use super::state::{Flight, State};
-use crate::landmarks::seen::{self, POSE, Seen};
+use super::rows::{ResidualRow, Sink, UNSEEN};
+use super::state::{Flight, FlightState};
+use crate::landmarks::seen::{self, ClickResidual, POSE};
 use crate::survey::{Click, SurveyedLandmark};
 
 /// A landmark's click, compared with where a flight's calibration has it.
@@ -24,7 +24,7 @@ pub struct LandmarkMisfit {
     pub deviations: f64,
 }
 
-impl State {
+impl FlightState {
     /// Rows of landmarks in the pictures. The error of a landmark's place is common to all cameras
     /// that see it, so its clicks are whitened together.
     pub(super) fn landmark_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
@@ -35,7 +35,7 @@ impl State {
                 // lower the cost.
                 sink.take(&[(Vec::new(), UNSEEN), (Vec::new(), UNSEEN)], Tails::Heavy);
             }
-            let seen: Vec<(usize, &Click, Seen)> =
+            let seen: Vec<(usize, &Click, ClickResidual)> =
                 clicks.into_iter().filter_map(|(k, click, seen)| Some((k, click, seen?))).collect();
             // Its place may be another landmark's, or a click may have missed it.
             sink.take(&self.whitened_clicks(&seen).unwrap_or_default(), Tails::Heavy);
@@ -48,11 +48,11 @@ impl State {
         &self,
         flight: &Flight<'_>,
         landmark: &'a SurveyedLandmark,
-    ) -> Vec<(usize, &'a Click, Option<Seen>)> {
+    ) -> Vec<(usize, &'a Click, Option<ClickResidual>)> {
         let clicks = landmark.clicks.iter().filter_map(|click| {
             let index = flight.cameras.iter().position(|camera| camera.name == click.camera)?;
             let camera = &self.cameras[index];
-            let state = seen::State {
+            let state = seen::PoseAndLens {
                 rotation: camera.rotation,
                 centre: camera.centre,
                 intrinsics: camera.intrinsics,
@@ -62,7 +62,10 @@ impl State {
         clicks.collect()
     }
 
-    fn whitened_clicks(&self, clicks: &[(usize, &Click, Seen)]) -> Option<Vec<Row>> {
+    fn whitened_clicks(
+        &self,
+        clicks: &[(usize, &Click, ClickResidual)],
+    ) -> Option<Vec<ResidualRow>> {
         let (starts, rows) = (self.starts(), 2 * clicks.len());
         let mut by_place = OMatrix::<f64, Dyn, U3>::zeros(rows);
         let mut noise = DMatrix::zeros(rows, rows);
@@ -76,7 +79,7 @@ impl State {
         noise += &by_place * by_place.transpose();
         let whitening = noise.cholesky()?.l().try_inverse()?;
         residual = &whitening * residual;
-        let row = |row: usize| -> Row {
+        let row = |row: usize| -> ResidualRow {
             let mut terms = Vec::new();
             // The whitening matrix is lower triangular: each row only depends on its own click and
             // those before.
@@ -95,22 +98,23 @@ impl State {
     /// The misfit of each click.
     pub(super) fn landmark_misfits(&self, flight: &Flight<'_>) -> Vec<LandmarkMisfit> {
         let misfits = flight.survey.landmarks.iter().flat_map(|landmark| {
-            let misfit = |(_, click, seen): (usize, &Click, Option<Seen>)| LandmarkMisfit {
-                landmark: landmark.name.clone(),
-                camera: click.camera.clone(),
-                residual_px: seen.as_ref().map(|seen| -seen.residual),
-                deviations: seen
-                    .as_ref()
-                    .and_then(|seen| deviations(seen, click))
-                    .unwrap_or(UNSEEN),
-            };
+            let misfit =
+                |(_, click, seen): (usize, &Click, Option<ClickResidual>)| LandmarkMisfit {
+                    landmark: landmark.name.clone(),
+                    camera: click.camera.clone(),
+                    residual_px: seen.as_ref().map(|seen| -seen.residual),
+                    deviations: seen
+                        .as_ref()
+                        .and_then(|seen| deviations(seen, click))
+                        .unwrap_or(UNSEEN),
+                };
             self.clicks(flight, landmark).into_iter().map(misfit).collect::<Vec<_>>()
         });
         misfits.collect()
     }
 }
 
-fn deviations(seen: &Seen, click: &Click) -> Option<f64> {
+fn deviations(seen: &ClickResidual, click: &Click) -> Option<f64> {
     let weight = seen.noise(click.sd_px).try_inverse()?;
     Some(seen.residual.dot(&(weight * seen.residual)).sqrt())
 }

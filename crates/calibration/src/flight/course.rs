@@ -5,8 +5,8 @@ use nalgebra::Point3;
 use super::adjustment::{self, NEARLY_SETTLED};
 use super::model::{FlightLog, LogErrors};
 use super::settle::jerk;
-use super::spline::{KNOT_S, Spline, Weights};
-use super::state::{Flight, Priors, RATE_SD, State};
+use super::spline::{KNOT_S, TrajectorySpline, Weights};
+use super::state::{Flight, FlightState, Priors, RATE_SD};
 use crate::survey::Survey;
 
 /// Between samples farther apart than this the target's place counts as unknown, s: or than this
@@ -17,7 +17,7 @@ const GAP_STEPS: f64 = 2.5;
 /// A trajectory, with the times at which it is known.
 #[derive(Clone, Debug)]
 pub(super) struct Course {
-    pub(super) way: Spline,
+    pub(super) way: TrajectorySpline,
     /// Power of its jerk, m^2/s^5.
     pub(super) jerk: f64,
     pub(super) errors: LogErrors,
@@ -32,9 +32,9 @@ impl Course {
         const FIRST_JERK: f64 = 10.0;
         let (from, to) = (log.samples.first()?.time_s, log.samples.last()?.time_s);
         let flight = Flight { cameras: &[], log: Some(log), survey: &Survey::default() };
-        let way = Spline::over(from, to + KNOT_S);
+        let way = TrajectorySpline::over(from, to + KNOT_S);
         let bias = vec![way.drift(); 3];
-        let mut state = State { way, cameras: Vec::new(), bias };
+        let mut state = FlightState { way, cameras: Vec::new(), bias };
         let mut priors = Priors { jerk: FIRST_JERK, rate_sd: RATE_SD, cameras: Vec::new() };
         for _ in 0..ROUNDS {
             let adjusted = adjustment::adjust(&flight, &priors, state, NEARLY_SETTLED)?;
@@ -46,7 +46,12 @@ impl Course {
     }
 
     /// From a trajectory that is known at these times, in order.
-    pub(super) fn along(way: Spline, jerk: f64, errors: LogErrors, times_s: Vec<f64>) -> Self {
+    pub(super) fn along(
+        way: TrajectorySpline,
+        jerk: f64,
+        errors: LogErrors,
+        times_s: Vec<f64>,
+    ) -> Self {
         let mut steps: Vec<f64> = times_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
         steps.sort_unstable_by(f64::total_cmp);
         let usual = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
@@ -69,13 +74,13 @@ impl Course {
     /// A course that is known at no time.
     pub(super) fn nowhere() -> Self {
         let errors = LogErrors { sd_m: 1.0, drift_sd_m: 0.0, drift_time_s: 1.0 };
-        Self::along(Spline::over(0.0, 1.0), 1.0, errors, Vec::new())
+        Self::along(TrajectorySpline::over(0.0, 1.0), 1.0, errors, Vec::new())
     }
 
     /// Makes a spline follow the course: as it is where it is known, straight from one known place
     /// to the next, and constant before its begin and after its end. A smooth trajectory through an
     /// unknown stretch swings far out, and labels there would be left beside it.
-    pub(super) fn lead(&self, way: &mut Spline) {
+    pub(super) fn lead(&self, way: &mut TrajectorySpline) {
         let known = |time_s: f64| Some(self.way.place(&self.way.weights(time_s)?).coords);
         let at = |time_s: f64| {
             if self.weights(time_s).is_some() {

@@ -7,8 +7,8 @@
 use crossfix_message::{Datum, Timestamp};
 use nalgebra::{DMatrix, DVector, Point3, SMatrix, Vector3};
 
-use super::model::{CLOCK, CameraState};
-use super::state::State;
+use super::model::{CLOCK, CameraUnknowns};
+use super::state::FlightState;
 
 /// Without a log the common time is one camera's, whose clock may show anything: its deviation, s.
 const UNKNOWN_S: f64 = 1e3;
@@ -22,7 +22,7 @@ pub(super) struct Followers {
 }
 
 /// The datum as estimated from the cameras, and how well it is known.
-pub(super) struct Shown {
+pub(super) struct EstimatedDatum {
     /// The datum's components (rows) from the cameras' differences (columns).
     gain: DMatrix<f64>,
     /// Information on the datum, ...
@@ -33,11 +33,11 @@ pub(super) struct Shown {
 
 impl Followers {
     /// Those of all cameras.
-    pub(super) fn of(state: &State) -> Self {
+    pub(super) fn of(state: &FlightState) -> Self {
         let count = state.cameras.len().max(1) as f64;
         let centres = state.cameras.iter().map(|camera| camera.centre.coords);
         let middle = Point3::from(centres.sum::<Vector3<f64>>() / count);
-        let reference = |camera: &CameraState| camera.clock.common_s(camera.clock.reference_s);
+        let reference = |camera: &CameraUnknowns| camera.clock.common_s(camera.clock.reference_s);
         let time_s = state.cameras.iter().map(reference).sum::<f64>() / count;
         let (first, starts) = (state.order().chain(), state.starts());
         let unknowns = starts.last().copied().unwrap_or(first) - first;
@@ -70,7 +70,7 @@ impl Followers {
     /// uncorrelated: `D = (H' N H)^-1` where the cameras follow the datum by H and N is the
     /// information. Better known cameras count for more in it than poorly known ones. `None`: there
     /// is no information.
-    pub(super) fn shown(&self, information: &DMatrix<f64>) -> Option<Shown> {
+    pub(super) fn shown(&self, information: &DMatrix<f64>) -> Option<EstimatedDatum> {
         let weighed = information * &self.by_datum;
         let on_datum = self.by_datum.tr_mul(&weighed);
         let covariance = inverse_of_what_is_shown(&on_datum)?;
@@ -78,18 +78,22 @@ impl Followers {
         // covariance.
         let gain = &covariance * weighed.transpose();
         let of_cameras = &self.by_datum * &covariance * self.by_datum.transpose();
-        Some(Shown { gain, information: on_datum, of_cameras })
+        Some(EstimatedDatum { gain, information: on_datum, of_cameras })
     }
 
     /// The cameras' differences with the datum's part removed.
-    pub(super) fn without_datum(&self, shown: &Shown, differences: &DVector<f64>) -> DVector<f64> {
+    pub(super) fn without_datum(
+        &self,
+        shown: &EstimatedDatum,
+        differences: &DVector<f64>,
+    ) -> DVector<f64> {
         differences - &self.by_datum * (&shown.gain * differences)
     }
 
     /// The site's datum, where `prior_information` of the information on it comes from no measurement.
     pub(super) fn datum(
         &self,
-        shown: &Shown,
+        shown: &EstimatedDatum,
         prior_information: &DMatrix<f64>,
         is_timeless: bool,
     ) -> Datum {
@@ -112,7 +116,7 @@ impl Followers {
     }
 }
 
-impl Shown {
+impl EstimatedDatum {
     /// Matrix that gives the datum's components from the cameras' differences.
     pub(super) fn into_gain(self) -> DMatrix<f64> {
         self.gain

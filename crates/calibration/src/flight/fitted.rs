@@ -4,7 +4,7 @@ use crossfix_geometry::Pixel;
 use nalgebra::{Point3, Vector2, Vector3};
 
 use super::model::FlightLog;
-use super::state::{Flight, State};
+use super::state::{Flight, FlightState};
 
 /// A label, compared with where its target should have been seen.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -62,7 +62,7 @@ impl FittedSample {
 }
 
 /// A camera's labels where the trajectory reaches them, in the order of its own time.
-pub(super) fn labels(flight: &Flight<'_>, state: &State, index: usize) -> Vec<FittedLabel> {
+pub(super) fn labels(flight: &Flight<'_>, state: &FlightState, index: usize) -> Vec<FittedLabel> {
     let camera = &state.cameras[index];
     let fitted = |label: &super::Label| {
         let time_s = camera.time_s(label);
@@ -81,7 +81,7 @@ pub(super) fn labels(flight: &Flight<'_>, state: &State, index: usize) -> Vec<Fi
 }
 
 /// A log's samples at times of the trajectory.
-pub(super) fn samples(log: &FlightLog, state: &State) -> Vec<FittedSample> {
+pub(super) fn samples(log: &FlightLog, state: &FlightState) -> Vec<FittedSample> {
     let fitted = |sample: &super::LogSample| {
         let weights = state.way.weights(sample.time_s)?;
         Some(FittedSample {

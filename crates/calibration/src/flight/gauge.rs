@@ -11,8 +11,8 @@ use nalgebra::{DMatrix, DVector};
 use super::datum::Followers;
 use super::model::{CLOCK, step_between};
 use super::noise::Tails;
-use super::rows::{Row, Sink};
-use super::state::State;
+use super::rows::{ResidualRow, Sink};
+use super::state::FlightState;
 
 /// Deviations of the constraint on the site as a whole: shift (m), turn (rad), growth, lateness
 /// (s). Rounding errors are ten digits below them, far under the accuracy of the cameras beside the
@@ -22,14 +22,14 @@ const HELD: [f64; Datum::WAYS - 1] = [10.0, 10.0, 10.0, 0.1, 0.1, 0.1, 0.1, 1.0]
 /// The constraint.
 #[derive(Clone, Debug)]
 pub(super) struct Gauge {
-    from: State,
+    from: FlightState,
     /// The datum's components (rows) from the cameras' own unknowns (columns).
     gain: DMatrix<f64>,
 }
 
 impl Gauge {
     /// Constraint to a state.
-    pub(super) fn of(from: &State) -> Option<Self> {
+    pub(super) fn of(from: &FlightState) -> Option<Self> {
         // A turn is weighted by how far it moves a point at this range.
         const RANGE_M: f64 = 30.0;
         let followers = Followers::of(from);
@@ -44,7 +44,7 @@ impl Gauge {
         Some(Self { from: from.clone(), gain: followers.shown(&weight)?.into_gain() })
     }
 
-    pub(super) fn rows(&self, state: &State, sink: &mut impl Sink) {
+    pub(super) fn rows(&self, state: &FlightState, sink: &mut impl Sink) {
         let first = state.order().chain();
         let pairs = self.from.cameras.iter().zip(&state.cameras);
         let moved = DVector::from_vec(pairs.flat_map(|(a, b)| step_between(a, b)).collect());
@@ -52,7 +52,7 @@ impl Gauge {
         for (way, sd) in HELD.iter().enumerate() {
             let gain = self.gain.row(way);
             let terms = gain.iter().enumerate().filter(|(_, by)| **by != 0.0);
-            let row: Row =
+            let row: ResidualRow =
                 (terms.map(|(k, by)| (first + k, by / sd)).collect(), as_a_whole[way] / sd);
             sink.take(&[row], Tails::Normal);
         }

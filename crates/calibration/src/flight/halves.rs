@@ -6,11 +6,11 @@
 
 use nalgebra::{DMatrix, DVector, Matrix2xX, Point3, Vector3};
 
-use super::adjustment::{self, Adjusted, NEARLY_SETTLED};
+use super::adjustment::{self, AdjustedFlight, NEARLY_SETTLED};
 use super::datum::Followers;
 use super::error::LEAST_LABELS;
-use super::model::{CameraLabels, CameraState, Label, MOST_OWN, step_between};
-use super::state::{Flight, Priors, State};
+use super::model::{CameraLabels, CameraUnknowns, Label, MOST_OWN, step_between};
+use super::state::{Flight, FlightState, Priors};
 use crate::label_noise::LabelNoise;
 
 /// Of a camera's labels one in this many is compared: they are many, and neighbours tell the same.
@@ -25,16 +25,16 @@ const MOST_STATED: f64 = 10.0;
 pub(super) fn ratios(
     flight: &Flight<'_>,
     priors: &Priors,
-    adjusted: &Adjusted,
+    adjusted: &AdjustedFlight,
 ) -> Vec<Option<f64>> {
     let count = flight.cameras.len();
     compared(flight, priors, &adjusted.state).unwrap_or_else(|| vec![None; count])
 }
 
-fn compared(flight: &Flight<'_>, priors: &Priors, state: &State) -> Option<Vec<Option<f64>>> {
+fn compared(flight: &Flight<'_>, priors: &Priors, state: &FlightState) -> Option<Vec<Option<f64>>> {
     let middle_s = middle(flight, state)?;
     let half = |is_late: bool| -> Vec<CameraLabels> {
-        let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
+        let of_camera = |(camera, state): (&CameraLabels, &CameraUnknowns)| {
             let is_in = |label: &&Label| (state.time_s(label) >= middle_s) == is_late;
             let labels = camera.labels.iter().filter(is_in).copied().collect();
             CameraLabels { labels, ..camera.clone() }
@@ -50,7 +50,7 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &State) -> Option<Vec<O
     let saw_both =
         |index: usize| halves.iter().all(|cameras| cameras[index].labels.len() >= LEAST_LABELS);
     let shown: Vec<usize> = (0..state.cameras.len()).filter(|&index| saw_both(index)).collect();
-    let apart = Apart::of(state, [&first, &second], &shown)?;
+    let apart = HalfDifference::of(state, [&first, &second], &shown)?;
     let mut ratios = vec![None; state.cameras.len()];
     for (start, &index) in apart.starts.iter().zip(&shown) {
         let noise = &priors.cameras[index].noise;
@@ -60,8 +60,8 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &State) -> Option<Vec<O
 }
 
 /// The time that splits all labels in half.
-fn middle(flight: &Flight<'_>, state: &State) -> Option<f64> {
-    let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
+fn middle(flight: &Flight<'_>, state: &FlightState) -> Option<f64> {
+    let of_camera = |(camera, state): (&CameraLabels, &CameraUnknowns)| {
         camera.labels.iter().map(|label| state.time_s(label)).collect::<Vec<_>>()
     };
     let mut times: Vec<f64> =
@@ -72,15 +72,15 @@ fn middle(flight: &Flight<'_>, state: &State) -> Option<f64> {
 
 /// Difference between the halves of the cameras' own unknowns, without the datum, and the
 /// covariance that this difference should have.
-struct Apart {
+struct HalfDifference {
     difference: DVector<f64>,
     covariance: DMatrix<f64>,
     /// Index of each camera's first unknown.
     starts: Vec<usize>,
 }
 
-impl Apart {
-    fn of(state: &State, halves: [&Adjusted; 2], shown: &[usize]) -> Option<Self> {
+impl HalfDifference {
+    fn of(state: &FlightState, halves: [&AdjustedFlight; 2], shown: &[usize]) -> Option<Self> {
         let (first, all) = (state.order().chain(), state.starts());
         let own = |index: &usize| all[*index] - first..all[*index + 1] - first;
         let rows: Vec<usize> = shown.iter().flat_map(own).collect();
@@ -111,7 +111,7 @@ impl Apart {
     fn ratio(
         &self,
         flight: &Flight<'_>,
-        state: &State,
+        state: &FlightState,
         (index, start): (usize, usize),
         noise: &LabelNoise,
     ) -> Option<f64> {
@@ -139,7 +139,7 @@ impl Apart {
 }
 
 /// Derivatives of a fixed place's image by the camera's own unknowns.
-fn in_image(camera: &CameraState, label: &Label, place: Point3<f64>) -> Option<Matrix2xX<f64>> {
+fn in_image(camera: &CameraUnknowns, label: &Label, place: Point3<f64>) -> Option<Matrix2xX<f64>> {
     let by_own: [_; MOST_OWN] = camera.see(label, place, Vector3::zeros())?.by_own;
     Some(Matrix2xX::from_columns(&by_own[..camera.own()]))
 }

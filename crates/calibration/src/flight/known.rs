@@ -5,8 +5,8 @@ use nalgebra::{DMatrix, DVector, Rotation3};
 
 use super::model::{CameraLabels, POSE_AND_CLOCK};
 use super::noise::Tails;
-use super::rows::{Row, Sink};
-use super::state::{Flight, State};
+use super::rows::{ResidualRow, Sink};
+use super::state::{Flight, FlightState};
 use crate::calibrated_camera::CalibratedCamera;
 use crate::lens;
 
@@ -25,7 +25,7 @@ impl Flight<'_> {
     }
 }
 
-impl State {
+impl FlightState {
     /// Rows of a camera's pose and lens by an earlier calibration. The pose is correlated with the
     /// lens; the stated pose covariance is what remains once the lens is known. The camera may have
     /// been moved since, so its tails are heavy.
@@ -46,7 +46,7 @@ impl State {
         if let Some(whitened) = whitening(&covariance) {
             let beside = &whitened * (&pose - by_lens * &lens);
             let follows = &whitened * by_lens;
-            let row = |axis: usize| -> Row {
+            let row = |axis: usize| -> ResidualRow {
                 let of_pose = (0..6).map(|k| (start + k, whitened[(axis, k)]));
                 let of_lens = (0..count).map(|k| (start + POSE_AND_CLOCK + k, -follows[(axis, k)]));
                 (of_pose.chain(of_lens).collect(), beside[axis])
@@ -55,7 +55,7 @@ impl State {
         }
         if let Some(whitened) = whitening(&known.lens.covariance) {
             let beside = &whitened * &lens;
-            let row = |axis: usize| -> Row {
+            let row = |axis: usize| -> ResidualRow {
                 let terms = (0..count).map(|k| (start + POSE_AND_CLOCK + k, whitened[(axis, k)]));
                 (terms.collect(), beside[axis])
             };
@@ -66,7 +66,7 @@ impl State {
 
 /// Step from the known pose to the state's: a turn about the camera's axes (rad), and its centre
 /// (m).
-fn pose_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DVector<f64> {
+fn pose_step(known: &CalibratedCamera, camera: &super::model::CameraUnknowns) -> DVector<f64> {
     let pose = known.camera.pose();
     let turn = Rotation3::from_matrix_unchecked(
         pose.rotation().matrix().transpose() * camera.rotation.matrix(),
@@ -75,7 +75,7 @@ fn pose_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DV
     DVector::from_iterator(6, turn_vector(&turn).iter().chain(moved.iter()).copied())
 }
 
-fn lens_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DVector<f64> {
+fn lens_step(known: &CalibratedCamera, camera: &super::model::CameraUnknowns) -> DVector<f64> {
     let known = lens::values(known.camera.model().intrinsics());
     let now = lens::values(&camera.intrinsics);
     DVector::from_iterator(known.len().min(now.len()), now.iter().zip(&known).map(|(a, b)| a - b))

@@ -3,12 +3,12 @@
 
 use nalgebra::Vector2;
 
-use super::model::{CameraLabels, Label, MOST_OWN, Seen};
+use super::model::{CameraLabels, Label, LabelResidual, MOST_OWN};
 use super::noise::{Tails, Whitening};
-use super::normal::Term;
-use super::rows::{Row, Sink, UNSEEN};
+use super::normal::Derivative;
+use super::rows::{ResidualRow, Sink, UNSEEN};
 use super::spline::{KNOT_S, SPAN};
-use super::state::{CameraPriors, State};
+use super::state::{CameraPriors, FlightState};
 use super::unknowns::Touched;
 
 /// Labels farther apart in time than this are taken to have independent errors, s. At most the
@@ -17,7 +17,7 @@ pub(super) const LONGEST_PAIR_S: f64 = KNOT_S;
 /// Unknowns of the target's trajectory that two successive labels touch: five coefficients.
 const OF_A_PAIR: usize = 3 * (SPAN + 1);
 
-impl State {
+impl FlightState {
     pub(super) fn label_rows<S: Sink>(
         &self,
         index: usize,
@@ -26,7 +26,7 @@ impl State {
         priors: &CameraPriors,
         sink: &mut S,
     ) {
-        let mut before: Option<(f64, Placed)> = None;
+        let mut before: Option<(f64, LabelRow)> = None;
         for label in &camera.labels {
             let placed = self.placed(index, label);
             let Some(placed) = placed else {
@@ -60,18 +60,18 @@ impl State {
 
     /// Derivatives of both axes of a label, in pixels, by the unknowns; `None` where it is not
     /// seen.
-    pub(super) fn derivatives(&self, index: usize, label: &Label) -> Option<[Vec<Term>; 2]> {
+    pub(super) fn derivatives(&self, index: usize, label: &Label) -> Option<[Vec<Derivative>; 2]> {
         let placed = self.placed(index, label)?;
         let alone = Whitening { kept: 0.0, sd_px: 1.0 };
         let rows = self.whitened(index, self.starts()[index], &placed, None, alone);
         Some(rows.map(|(terms, _)| terms))
     }
 
-    fn placed(&self, index: usize, label: &Label) -> Option<Placed> {
+    fn placed(&self, index: usize, label: &Label) -> Option<LabelRow> {
         let (first, weights, seen) = self.see(index, label)?;
         let clock = &self.cameras[index].clock;
         let wander = clock.wander.weights(clock.straight_s(label.time_s));
-        let placed = Placed { first, weights, seen, wander };
+        let placed = LabelRow { first, weights, seen, wander };
         placed.touched().fit().then_some(placed)
     }
 
@@ -80,17 +80,17 @@ impl State {
         &self,
         index: usize,
         start: usize,
-        now: &Placed,
-        before: Option<&Placed>,
+        now: &LabelRow,
+        before: Option<&LabelRow>,
         whitening: Whitening,
-    ) -> [Row; 2] {
+    ) -> [ResidualRow; 2] {
         let Whitening { kept, sd_px } = whitening;
         let residuals = whitened_residual(now, before, whitening);
         let (order, own) = (self.order(), self.cameras[index].own());
         let first = before.map_or(now.first, |before| before.first);
         [0, 1].map(|axis| {
             let mut chain = [0.0; OF_A_PAIR];
-            let mut terms: Vec<Term> = Vec::with_capacity(OF_A_PAIR + own + 4);
+            let mut terms: Vec<Derivative> = Vec::with_capacity(OF_A_PAIR + own + 4);
             let mut own_terms = [0.0; MOST_OWN];
             // Row = (this label - kept x the label before) / sd_px.
             let parts = [Some((now, 1.0)), before.map(|before| (before, -kept))];
@@ -122,25 +122,25 @@ impl State {
 
 /// A label's residual and the unknowns of the chain that it depends on.
 #[derive(Clone, Copy, Debug)]
-struct Placed {
+struct LabelRow {
     first: usize,
     weights: [f64; SPAN],
-    seen: Seen,
+    seen: LabelResidual,
     wander: [(usize, f64); 2],
 }
 
 /// A label's residual less the share `kept` of the residual before it, divided by the deviation of
 /// the remainder.
 fn whitened_residual(
-    now: &Placed,
-    before: Option<&Placed>,
+    now: &LabelRow,
+    before: Option<&LabelRow>,
     Whitening { kept, sd_px }: Whitening,
 ) -> [f64; 2] {
     let carried = before.map_or(Vector2::zeros(), |before| before.seen.residual * kept);
     ((now.seen.residual - carried) / sd_px).into()
 }
 
-impl Placed {
+impl LabelRow {
     fn touched(&self) -> Touched {
         Touched::by(self.first, self.wander[0].0)
     }

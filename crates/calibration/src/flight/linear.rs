@@ -4,7 +4,7 @@
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, SVector, Vector3};
 
 /// A direction in the camera's frame, and the place that is seen there.
-pub(super) type Seen = (Vector3<f64>, Point3<f64>);
+pub(super) type DirectionToPlace = (Vector3<f64>, Point3<f64>);
 
 /// Rounds in which pairs that do not fit are given less weight: with half as many rounds a tenth of
 /// outliers still bends the solution.
@@ -13,29 +13,30 @@ const ROUNDS: usize = 6;
 /// A linear map from places to directions, `d ~ M X + m` with any matrix M, so that it also fits a
 /// camera whose lens or log is stretched.
 #[derive(Clone, Debug)]
-pub(super) struct Linear {
+pub(super) struct LinearMap {
     /// M, up to its scale.
     pub(super) matrix: Matrix3<f64>,
     shift: Vector3<f64>,
 }
 
-impl Linear {
+impl LinearMap {
     /// The map with the sign that puts most places ahead of the camera.
-    fn new(matrix: Matrix3<f64>, shift: Vector3<f64>, pairs: &[Seen]) -> Self {
-        let is_ahead =
-            |(direction, place): &&Seen| direction.dot(&(matrix * place.coords + shift)) > 0.0;
+    fn new(matrix: Matrix3<f64>, shift: Vector3<f64>, pairs: &[DirectionToPlace]) -> Self {
+        let is_ahead = |(direction, place): &&DirectionToPlace| {
+            direction.dot(&(matrix * place.coords + shift)) > 0.0
+        };
         let ahead = pairs.iter().filter(is_ahead).count();
         let sign = if 2 * ahead >= pairs.len() { 1.0 } else { -1.0 };
         Self { matrix: matrix * sign, shift: shift * sign }
     }
 
     /// Angle between a direction and the direction in which the map has its place, rad.
-    fn misfit(&self, (direction, place): &Seen) -> f64 {
+    fn misfit(&self, (direction, place): &DirectionToPlace) -> f64 {
         (self.matrix * place.coords + self.shift).angle(direction)
     }
 
     /// The angle that [`FITTING`] of all pairs lie below, rad.
-    pub(super) fn typical_misfit(&self, pairs: &[Seen]) -> f64 {
+    pub(super) fn typical_misfit(&self, pairs: &[DirectionToPlace]) -> f64 {
         typical(pairs.iter().map(|pair| self.misfit(pair)))
     }
 
@@ -78,10 +79,10 @@ fn quantile(numbers: impl Iterator<Item = f64>, share: f64) -> f64 {
 
 /// The map that most pairs fit: outliers, such as birds among the labels, are given less weight
 /// from round to round.
-pub(super) fn robust(pairs: &[Seen]) -> Option<Linear> {
+pub(super) fn robust(pairs: &[DirectionToPlace]) -> Option<LinearMap> {
     let axes = Normalised::of(pairs)?;
     let mut weights = vec![1.0; pairs.len()];
-    let mut best: Option<(f64, Linear)> = None;
+    let mut best: Option<(f64, LinearMap)> = None;
     for _ in 0..ROUNDS {
         let linear = axes.in_space(pairs, &weights)?;
         let misfit = linear.typical_misfit(pairs);
@@ -100,13 +101,13 @@ pub(super) fn robust(pairs: &[Seen]) -> Option<Linear> {
 const LEAST_RAD: f64 = 1e-5;
 
 /// The direct linear transformation: `d x (M X + m) = 0` for every direction d and place X.
-pub(super) fn in_space(pairs: &[Seen]) -> Option<Linear> {
+pub(super) fn in_space(pairs: &[DirectionToPlace]) -> Option<LinearMap> {
     Normalised::of(pairs)?.in_space(pairs, &vec![1.0; pairs.len()])
 }
 
 /// The same for places in a plane, as of a flight at one height: the third axis follows from the
 /// first two.
-pub(super) fn in_plane(pairs: &[Seen]) -> Option<Linear> {
+pub(super) fn in_plane(pairs: &[DirectionToPlace]) -> Option<LinearMap> {
     Normalised::of(pairs)?.in_plane(pairs)
 }
 
@@ -119,7 +120,7 @@ struct Normalised {
 }
 
 impl Normalised {
-    fn of(pairs: &[Seen]) -> Option<Self> {
+    fn of(pairs: &[DirectionToPlace]) -> Option<Self> {
         let count = pairs.len() as f64;
         let middle =
             Point3::from(pairs.iter().map(|(_, p)| p.coords).sum::<Vector3<f64>>() / count);
@@ -146,16 +147,21 @@ impl Normalised {
     }
 
     /// Converts a map of normalised coordinates into one of world coordinates.
-    fn in_world(&self, matrix: &Matrix3<f64>, shift: &Vector3<f64>, pairs: &[Seen]) -> Linear {
+    fn in_world(
+        &self,
+        matrix: &Matrix3<f64>,
+        shift: &Vector3<f64>,
+        pairs: &[DirectionToPlace],
+    ) -> LinearMap {
         // d ~ N A' (X - c) / s + n, with N and n of the normalised places: up to the factor s,
         // M = N A' and m = s n - M c.
         let from_world = matrix * self.axes.transpose();
         let shift = shift * self.scale - from_world * self.middle.coords;
-        Linear::new(from_world, shift, pairs)
+        LinearMap::new(from_world, shift, pairs)
     }
 
     /// See [`in_space`]; each pair counts with its weight.
-    fn in_space(&self, pairs: &[Seen], weights: &[f64]) -> Option<Linear> {
+    fn in_space(&self, pairs: &[DirectionToPlace], weights: &[f64]) -> Option<LinearMap> {
         let sum: SMatrix<f64, 12, 12> =
             squares(pairs.iter().zip(weights).map(|((direction, place), weight)| {
                 let place = self.place(*place);
@@ -169,7 +175,7 @@ impl Normalised {
     }
 
     /// See [`in_plane`].
-    fn in_plane(&self, pairs: &[Seen]) -> Option<Linear> {
+    fn in_plane(&self, pairs: &[DirectionToPlace]) -> Option<LinearMap> {
         let sum: SMatrix<f64, 9, 9> = squares(pairs.iter().map(|(direction, place)| {
             let place = self.place(*place);
             (direction, [place.x, place.y, 1.0], 1.0)

@@ -40,7 +40,7 @@ mod unknowns;
 mod way_rows;
 mod would_fit;
 
-use begin::Begun;
+use begin::BegunFlight;
 use error::{LEAST_SAMPLES, LONGEST_LOG_H};
 use model::hours;
 use results::results;
@@ -69,11 +69,11 @@ pub fn calibrate_flight(
     let (begun, state) = match log {
         Some(log) => {
             checked(log)?;
-            let begun = Begun::by_log(cameras, log)?;
+            let begun = BegunFlight::by_log(cameras, log)?;
             let state = begun.unknowns(true);
             (begun, state)
         }
-        None => Begun::by_pairs(cameras, survey)?,
+        None => BegunFlight::by_pairs(cameras, survey)?,
     };
     let flight = Flight { cameras: &begun.cameras, log, survey };
     let settled = settle(&flight, begun.priors(), state);

@@ -61,7 +61,7 @@ pub struct LogErrors {
 /// `straight = own + offset + rate (own - reference)`; a row of the image is read out
 /// `read-out (row / height - 1/2)` after the frame's time.
 #[derive(Clone, Debug)]
-pub(crate) struct Clock {
+pub(crate) struct ClockModel {
     pub(super) reference_s: f64,
     pub(super) offset_s: f64,
     pub(super) rate: f64,
@@ -104,11 +104,11 @@ impl Knots {
 
 /// The unknowns of a camera.
 #[derive(Clone, Debug)]
-pub(crate) struct CameraState {
+pub(crate) struct CameraUnknowns {
     /// World from camera.
     pub(super) rotation: Rotation3<f64>,
     pub(super) centre: Point3<f64>,
-    pub(super) clock: Clock,
+    pub(super) clock: ClockModel,
     pub(super) intrinsics: Intrinsics,
 }
 
@@ -120,7 +120,7 @@ pub(super) const CLOCK: usize = 6;
 /// Number of unknowns of pose, clock and the longest lens.
 pub(super) const MOST_OWN: usize = POSE_AND_CLOCK + lens::MOST_LENS_NUMBERS;
 
-impl CameraState {
+impl CameraUnknowns {
     /// Number of unknowns without the clock's wander, which changes with time and belongs to the
     /// chain.
     pub(super) fn own(&self) -> usize {
@@ -144,7 +144,7 @@ impl CameraState {
         label: &Label,
         place: Point3<f64>,
         velocity: Vector3<f64>,
-    ) -> Option<Seen> {
+    ) -> Option<LabelResidual> {
         let world_from_camera = self.rotation.matrix();
         let point = self.rotation.inverse_transform_vector(&(place - self.centre));
         let seen = lens::project(&self.intrinsics, &point)?;
@@ -165,7 +165,7 @@ impl CameraState {
         by_own[CLOCK + 2] = by_time * self.row_share(label.pixel);
         by_own[POSE_AND_CLOCK..].copy_from_slice(&seen.by_lens);
         let residual = seen.pixel - Vector2::new(label.pixel.x(), label.pixel.y());
-        Some(Seen { residual, by_place, by_time, by_own })
+        Some(LabelResidual { residual, by_place, by_time, by_own })
     }
 
     /// Moves the state by a step in the camera's own unknowns, in their order.
@@ -181,7 +181,7 @@ impl CameraState {
     }
 }
 
-impl Clock {
+impl ClockModel {
     /// The common time at a time of the camera's own clock, s.
     pub(super) fn common_s(&self, own_s: f64) -> f64 {
         let straight_s = self.straight_s(own_s);
@@ -196,7 +196,7 @@ impl Clock {
 
 /// A label's residual (the pixel predicted less the pixel labelled) with its derivatives.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Seen {
+pub(super) struct LabelResidual {
     pub(super) residual: Vector2<f64>,
     /// Derivative by the target's place, pixels per metre.
     pub(super) by_place: nalgebra::Matrix2x3<f64>,
@@ -207,7 +207,7 @@ pub(super) struct Seen {
 }
 
 /// Step in a camera's own unknowns that leads from one state to another.
-pub(super) fn step_between(from: &CameraState, to: &CameraState) -> Vec<f64> {
+pub(super) fn step_between(from: &CameraUnknowns, to: &CameraUnknowns) -> Vec<f64> {
     let turn: Rotation3<f64> = from.rotation.inverse() * to.rotation;
     let mut step: Vec<f64> = turn_vector(&turn).iter().copied().collect();
     step.extend((to.centre - from.centre).iter());

@@ -4,10 +4,10 @@
 use nalgebra::{Cholesky, DMatrix, DVector};
 
 /// An unknown that a residual depends on, and the residual's derivative with respect to it.
-pub(super) type Term = (usize, f64);
+pub(super) type Derivative = (usize, f64);
 
 /// A residual divided by its standard deviation, with the unknowns that it depends on.
-pub(super) type Row = (Vec<Term>, f64);
+pub(super) type ResidualRow = (Vec<Derivative>, f64);
 
 /// An unknown that two residuals depend on, with both derivatives.
 type TwoTerms = (usize, [f64; 2]);
@@ -102,7 +102,7 @@ impl Solution {
 impl Covariance {
     /// Variance of a linear combination of the chain's unknowns, all within the band's width, the
     /// others fixed.
-    pub(super) fn variance_held(&self, terms: &[Term]) -> f64 {
+    pub(super) fn variance_held(&self, terms: &[Derivative]) -> f64 {
         let covariance = |i: usize, j: usize| self.band[i.min(j) * self.width + i.abs_diff(j)];
         let mut sum = 0.0;
         for (at, &(i, x)) in terms.iter().enumerate() {
@@ -113,9 +113,9 @@ impl Covariance {
     }
 
     /// Variance of a linear combination of unknowns, those of the chain within the band's width.
-    pub(super) fn variance(&self, terms: &[Term]) -> f64 {
+    pub(super) fn variance(&self, terms: &[Derivative]) -> f64 {
         let chain = self.follows.ncols();
-        let (of_chain, of_others): (Vec<Term>, Vec<Term>) =
+        let (of_chain, of_others): (Vec<Derivative>, Vec<Derivative>) =
             terms.iter().partition(|(unknown, _)| *unknown < chain);
         let mut by_others = DVector::zeros(self.others.nrows());
         for &(unknown, by) in &of_chain {
@@ -161,7 +161,7 @@ impl NormalEquations {
     }
 
     /// Adds residuals with their weight. Terms may name an unknown more than once.
-    pub(super) fn add(&mut self, rows: &[Row], weight: f64) {
+    pub(super) fn add(&mut self, rows: &[ResidualRow], weight: f64) {
         if let [(first, a), (second, b)] = rows
             && first.len() == second.len()
             && first.iter().zip(second).all(|(first, second)| first.0 == second.0)
@@ -361,12 +361,13 @@ mod tests {
             let first = random.random_range(0..=CHAIN - WIDTH);
             let other = CHAIN + random.random_range(0..OTHERS);
             let columns = (first..first + WIDTH).chain([other]);
-            let terms: Vec<Term> = columns.map(|c| (c, random.random_range(-1.0..1.0))).collect();
+            let terms: Vec<Derivative> =
+                columns.map(|c| (c, random.random_range(-1.0..1.0))).collect();
             let residual = random.random_range(-1.0..1.0);
             // Another row with the same unknowns, and one that names an unknown twice.
             let turned = terms.iter().rev().map(|(_, by)| *by).zip(&terms);
-            let second: Vec<Term> = turned.map(|(by, (c, _))| (*c, by)).collect();
-            let twice: Vec<Term> = terms.iter().chain(&second[..2]).copied().collect();
+            let second: Vec<Derivative> = turned.map(|(by, (c, _))| (*c, by)).collect();
+            let twice: Vec<Derivative> = terms.iter().chain(&second[..2]).copied().collect();
             equations.add(&[(terms.clone(), residual), (second.clone(), 0.3)], 2.0);
             equations.add(&[(twice.clone(), -residual)], 2.0);
             for (terms, residual) in [(terms, residual), (second, 0.3), (twice, -residual)] {
@@ -386,7 +387,7 @@ mod tests {
         let held = dense.view((0, 0), (CHAIN, CHAIN)).into_owned().try_inverse().unwrap();
         let found = solution.covariance().unwrap();
         assert!((found.others() - marginal).amax() < 1e-9);
-        let sum = |terms: &[Term], of: &DMatrix<f64>| -> f64 {
+        let sum = |terms: &[Derivative], of: &DMatrix<f64>| -> f64 {
             terms.iter().flat_map(|a| terms.iter().map(|b| a.1 * b.1 * of[(a.0, b.0)])).sum()
         };
         let terms = [(7, 0.5), (9, -2.0), (12, 1.0)];

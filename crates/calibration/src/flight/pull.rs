@@ -7,12 +7,12 @@ use super::model::CLOCK;
 use super::normal::NormalEquations;
 use super::rows::Cost;
 use super::spline::{KNOT_S, SPAN};
-use super::state::{Flight, Priors, State};
+use super::state::{Flight, FlightState, Priors};
 
 /// Least size: a trajectory that hovers in a point has no size to be pulled on, m^2.
 const LEAST_SIZE2: f64 = 1.0;
 
-impl State {
+impl FlightState {
     /// Pull of the jerk's prior on the trajectory's size: by how much its negative log likelihood
     /// falls as the logarithm of the size decreases, to first order.
     ///

@@ -4,7 +4,7 @@ use crossfix_geometry::{Camera, Intrinsics, Pose};
 use crossfix_message::{CameraName, Datum};
 use nalgebra::{DMatrix, Matrix6};
 
-use super::adjustment::Adjusted;
+use super::adjustment::AdjustedFlight;
 use super::clicked::LandmarkMisfit;
 use super::datum::Followers;
 use super::error::Refusal;
@@ -13,7 +13,7 @@ use super::gauge::Gauge;
 use super::halves;
 use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
 use super::moved::{self, MovedAt};
-use super::state::{Flight, Priors, State, square};
+use super::state::{Flight, FlightState, Priors, square};
 use crate::calibrated_camera::{CalibratedCamera, ClockCorrection};
 use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
@@ -123,7 +123,7 @@ pub struct LogFit {
 
 pub(super) fn results(
     flight: &Flight<'_>,
-    mut adjusted: Adjusted,
+    mut adjusted: AdjustedFlight,
     priors: &Priors,
 ) -> Option<FlightResult> {
     let ratios = halves::ratios(flight, priors, &adjusted);
@@ -146,7 +146,7 @@ pub(super) fn results(
     let mut cameras = Vec::new();
     for (index, camera) in state.cameras.iter().enumerate() {
         let start = starts[index] - state.order().chain();
-        let at = Block { covariance: adjusted.covariance.others(), start };
+        let at = CameraBlock { covariance: adjusted.covariance.others(), start };
         let prior = &priors.cameras[index];
         let fitted = fitted::labels(flight, state, index);
         let within = |label: &&FittedLabel| label.beside_px.norm() < 4.0 * prior.noise.sd_px();
@@ -188,7 +188,7 @@ pub(super) fn results(
 }
 
 /// The median range at which a camera saw the target, m.
-fn middle_range(flight: &Flight<'_>, state: &State, index: usize) -> f64 {
+fn middle_range(flight: &Flight<'_>, state: &FlightState, index: usize) -> f64 {
     let camera = &state.cameras[index];
     let range = |label: &Label| {
         let weights = state.way.weights(camera.time_s(label))?;
@@ -220,12 +220,12 @@ fn log_fit(log: &FlightLog, samples: &[FittedSample]) -> LogFit {
 }
 
 /// One camera's part of the covariance of all unknowns outside the chain.
-struct Block<'a> {
+struct CameraBlock<'a> {
     covariance: &'a DMatrix<f64>,
     start: usize,
 }
 
-impl Block<'_> {
+impl CameraBlock<'_> {
     fn covariance_of(&self, a: usize, b: usize) -> f64 {
         self.covariance[(self.start + a, self.start + b)]
     }
@@ -262,7 +262,7 @@ const CLOCK_STEP_S: f64 = 5.0;
 
 fn clock_result(
     flight: &Flight<'_>,
-    adjusted: &Adjusted,
+    adjusted: &AdjustedFlight,
     index: usize,
     wander: f64,
 ) -> ClockResult {

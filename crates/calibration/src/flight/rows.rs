@@ -2,7 +2,7 @@
 //! them.
 
 use super::noise::Tails;
-pub(super) use super::normal::Row;
+pub(super) use super::normal::ResidualRow;
 
 /// Residual, in standard deviations, of a label that the trajectory does not reach or whose target
 /// lies behind the camera.
@@ -13,7 +13,7 @@ pub(super) trait Sink {
     /// Whether it uses the terms of rows, that is the derivatives.
     const TAKES_TERMS: bool = true;
 
-    fn take(&mut self, rows: &[Row], tails: Tails);
+    fn take(&mut self, rows: &[ResidualRow], tails: Tails);
 }
 
 /// The summed cost of rows: twice their negative log likelihood (see [`Tails::loss`]).
@@ -22,7 +22,7 @@ pub(super) struct Cost(pub(super) f64);
 impl Sink for Cost {
     const TAKES_TERMS: bool = false;
 
-    fn take(&mut self, rows: &[Row], tails: Tails) {
+    fn take(&mut self, rows: &[ResidualRow], tails: Tails) {
         self.0 +=
             tails.loss(rows.iter().map(|(_, residual)| residual * residual).sum(), rows.len());
     }

@@ -3,10 +3,10 @@
 
 use nalgebra::Vector2;
 
-use super::adjustment::{self, Adjusted, NEARLY_SETTLED, SETTLED};
-use super::normal::Term;
+use super::adjustment::{self, AdjustedFlight, NEARLY_SETTLED, SETTLED};
+use super::normal::Derivative;
 use super::spline::{KNOT_S, THIRD_DIFFERENCE};
-use super::state::{CameraPriors, Flight, Priors, State};
+use super::state::{CameraPriors, Flight, FlightState, Priors};
 use crate::label_noise::LabelNoise;
 
 /// Rounds in which deviations and powers are estimated beside the unknowns.
@@ -24,8 +24,8 @@ const MOST_AHEAD: f64 = 3.0;
 pub(super) fn settle(
     flight: &Flight<'_>,
     mut priors: Priors,
-    mut state: State,
-) -> Option<(Adjusted, Priors)> {
+    mut state: FlightState,
+) -> Option<(AdjustedFlight, Priors)> {
     let mut adjusted = None;
     for round in 0..ROUNDS {
         let is_last = round + 1 == ROUNDS;
@@ -46,7 +46,7 @@ pub(super) fn settle(
 }
 
 /// Priors with the noise, wander and jerk that an adjustment shows.
-fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
+fn learnt(flight: &Flight<'_>, adjusted: &AdjustedFlight, priors: &Priors) -> Priors {
     let state = &adjusted.state;
     let mut cameras = Vec::new();
     for (index, camera) in state.cameras.iter().enumerate() {
@@ -80,7 +80,7 @@ fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
 /// A camera's residuals with the times of its own clock.
 pub(super) fn residuals(
     flight: &Flight<'_>,
-    state: &State,
+    state: &FlightState,
     index: usize,
 ) -> Vec<(f64, Vector2<f64>)> {
     let labels = flight.cameras[index].labels.iter();
@@ -92,13 +92,13 @@ pub(super) fn residuals(
 /// What trajectory and clock follow from moment to moment was absorbed from labels whose variance
 /// had been enlarged ([`LabelNoise::caution`]), so it is less by that factor. What the cameras
 /// absorbed comes from the mean of many labels, which is as well known as stated.
-fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize, caution: f64) -> f64 {
+fn explained(flight: &Flight<'_>, adjusted: &AdjustedFlight, index: usize, caution: f64) -> f64 {
     const STRIDE: usize = 20;
     let (mut sum, mut count) = (0.0, 0);
     for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
         for terms in adjusted.state.derivatives(index, label).into_iter().flatten() {
             let chain = adjusted.state.order().chain();
-            let of_chain: Vec<Term> =
+            let of_chain: Vec<Derivative> =
                 terms.iter().copied().filter(|(unknown, _)| *unknown < chain).collect();
             let held = adjusted.covariance.variance_held(&of_chain);
             sum += held / caution + adjusted.covariance.variance(&terms) - held;
@@ -110,7 +110,7 @@ fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize, caution: f6
 
 /// Power of a clock's random walk, s^2/s: from the squares of its steps and the number of steps
 /// that the labels determine (MacKay's fixed point), and from what clocks are usually like.
-fn wander(adjusted: &Adjusted, camera: usize, before: f64) -> f64 {
+fn wander(adjusted: &AdjustedFlight, camera: usize, before: f64) -> f64 {
     let order = adjusted.state.order();
     let knots = &adjusted.state.cameras[camera].clock.wander;
     let (mut squares, mut told) = (0.0, 0.0);
@@ -130,7 +130,7 @@ fn wander(adjusted: &Adjusted, camera: usize, before: f64) -> f64 {
 
 /// Power of the jerk that a trajectory shows: its third differences, and their variance
 /// (expectation maximisation).
-pub(super) fn jerk(adjusted: &Adjusted) -> f64 {
+pub(super) fn jerk(adjusted: &AdjustedFlight) -> f64 {
     let (way, order) = (&adjusted.state.way, adjusted.state.order());
     let mut sum = 0.0;
     for first in 0..way.intervals() {

@@ -29,12 +29,12 @@ pub(super) struct Weights {
 
 /// A trajectory over a range of time.
 #[derive(Clone, Debug)]
-pub(super) struct Spline {
+pub(super) struct TrajectorySpline {
     start_s: f64,
     pub(super) coefficients: Vec<Vector3<f64>>,
 }
 
-impl Spline {
+impl TrajectorySpline {
     /// A trajectory that stays at the origin from one time to another, extended to a whole number
     /// of [`IN_A_STEP`] coefficients.
     pub(super) fn over(start_s: f64, end_s: f64) -> Self {
@@ -128,7 +128,7 @@ mod tests {
 
     #[test]
     fn it_holds_a_cubic_exactly_with_its_velocity_and_jerk() {
-        let mut spline = Spline::over(10.0, 14.0);
+        let mut spline = TrajectorySpline::over(10.0, 14.0);
         // A cubic's coefficients by its blossom: the product of the knots about each coefficient.
         for (k, coefficient) in spline.coefficients.iter_mut().enumerate() {
             let knot = |offset: f64| (k as f64 + offset) * KNOT_S;

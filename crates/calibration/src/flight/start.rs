@@ -3,9 +3,9 @@
 use nalgebra::{DMatrix, Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
 use super::course::Course;
-use super::linear::{self, Linear, Seen};
+use super::linear::{self, DirectionToPlace, LinearMap};
 use super::model::frame_time;
-use super::model::{CameraLabels, CameraState, Clock, Label};
+use super::model::{CameraLabels, CameraUnknowns, ClockModel, Label};
 use super::pieces;
 use crate::lens;
 
@@ -29,7 +29,7 @@ const FOLLOWED: usize = 12;
 
 /// A possible pose, and how much the camera's clock is behind the common time.
 #[derive(Clone, Debug)]
-struct Candidate {
+struct StartPose {
     rotation: Rotation3<f64>,
     centre: Point3<f64>,
     offset_s: f64,
@@ -52,7 +52,7 @@ pub(super) fn find(
     camera: &CameraLabels,
     course: &Course,
     frame_s: f64,
-) -> Option<(CameraState, f64)> {
+) -> Option<(CameraUnknowns, f64)> {
     let all = rays(camera, &camera.labels);
     let by_all = best_of(&all, &all, course, frame_s);
     let is_clear = by_all.as_ref().is_some_and(|found| found.misfit < CLEAR_RAD);
@@ -119,13 +119,13 @@ pub(super) fn at_once(labels: &[Label], time_s: f64, within_s: f64) -> bool {
 /// something else.
 pub(super) fn without_others(
     camera: &CameraLabels,
-    state: &CameraState,
+    state: &CameraUnknowns,
     course: &Course,
 ) -> CameraLabels {
     let (pieces, mut labels) = pieces::of_one_thing(camera, frame_time(camera));
-    let CameraState { rotation, centre, clock, .. } = state;
+    let CameraUnknowns { rotation, centre, clock, .. } = state;
     let (rotation, centre) = (*rotation, *centre);
-    let start = Candidate { rotation, centre, offset_s: clock.offset_s, misfit: 0.0 };
+    let start = StartPose { rotation, centre, offset_s: clock.offset_s, misfit: 0.0 };
     let near = |piece: &&Vec<Label>| start.lies_near(camera, piece, course, NEAR_RAD);
     labels.extend(pieces.iter().filter(near).flatten());
     of_labels(camera, labels)
@@ -139,12 +139,12 @@ pub(super) fn of_labels(camera: &CameraLabels, mut labels: Vec<Label>) -> Camera
 }
 
 /// The best pose over all offsets: begun with linear solutions of some rays, refined with all.
-fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<Candidate> {
-    let mut found: Vec<Candidate> =
+fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<StartPose> {
+    let mut found: Vec<StartPose> =
         offsets(some, course)?.flat_map(|offset_s| candidates(some, course, offset_s)).collect();
     found.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
     let cleaned = found.iter().take(CLEANED).filter_map(|one| cleaned(some, course, one.offset_s));
-    let cleaned: Vec<Candidate> = cleaned.collect();
+    let cleaned: Vec<StartPose> = cleaned.collect();
     found.extend(cleaned);
     found.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
     let followed = found.into_iter().take(FOLLOWED);
@@ -165,29 +165,29 @@ pub(super) fn state(
     camera: &CameraLabels,
     course: &Course,
     (rotation, centre, offset_s): (Rotation3<f64>, Point3<f64>, f64),
-) -> CameraState {
+) -> CameraUnknowns {
     let times = camera.labels.iter().map(|label| label.time_s);
     let (start, end) = times.fold((f64::INFINITY, f64::NEG_INFINITY), |(start, end), time_s| {
         (start.min(time_s), end.max(time_s))
     });
-    let clock = Clock {
+    let clock = ClockModel {
         reference_s: f64::midpoint(start, end),
         offset_s,
         rate: 0.0,
         readout_s: frame_time(camera) / 2.0,
         wander: course.way.drift(),
     };
-    CameraState { rotation, centre, clock, intrinsics: camera.intrinsics }
+    CameraUnknowns { rotation, centre, clock, intrinsics: camera.intrinsics }
 }
 
 /// The median angle between a camera's labels and a course, rad.
-pub(super) fn misfit_of(camera: &CameraLabels, state: &CameraState, course: &Course) -> f64 {
+pub(super) fn misfit_of(camera: &CameraLabels, state: &CameraUnknowns, course: &Course) -> f64 {
     let at = |ray: &Ray| {
         let weights = course.weights(state.clock.common_s(ray.time_s))?;
         Some((ray.direction, course.way.place(&weights)))
     };
     let rays = rays(camera, &camera.labels);
-    let pairs: Vec<Seen> = rays.iter().filter_map(at).collect();
+    let pairs: Vec<DirectionToPlace> = rays.iter().filter_map(at).collect();
     linear::median(angles(&pairs, &state.rotation, state.centre))
 }
 
@@ -203,15 +203,15 @@ fn rays(camera: &CameraLabels, labels: &[Label]) -> Vec<Ray> {
 }
 
 /// The linear solutions at a clock offset.
-fn candidates(rays: &[Ray], course: &Course, offset_s: f64) -> Vec<Candidate> {
+fn candidates(rays: &[Ray], course: &Course, offset_s: f64) -> Vec<StartPose> {
     let Some(pairs) = seen_at(rays, course, offset_s) else { return Vec::new() };
     let maps = [linear::in_space(&pairs), linear::in_plane(&pairs)].into_iter().flatten();
-    maps.filter_map(|map| Candidate::of(&map, &pairs, offset_s)).collect()
+    maps.filter_map(|map| StartPose::of(&map, &pairs, offset_s)).collect()
 }
 
 /// The linear map that fits the labels best over all offsets, whatever its lens and its log's axes,
 /// and the misfit that most labels stay below, rad.
-pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(Linear, f64)> {
+pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(LinearMap, f64)> {
     let rays = rays(camera, &pieces::longest(camera, frame_time(camera)));
     let maps = offsets(&rays, course)?.filter_map(|offset_s| {
         let pairs = seen_at(&rays, course, offset_s)?;
@@ -223,24 +223,24 @@ pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(Linear, 
 }
 
 /// The linear solution at a clock offset with outliers given less weight.
-fn cleaned(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Candidate> {
+fn cleaned(rays: &[Ray], course: &Course, offset_s: f64) -> Option<StartPose> {
     let pairs = seen_at(rays, course, offset_s)?;
-    Candidate::of(&linear::robust(&pairs)?, &pairs, offset_s)
+    StartPose::of(&linear::robust(&pairs)?, &pairs, offset_s)
 }
 
 /// Directions with the target's places at a clock offset, if there are enough.
-fn seen_at(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Vec<Seen>> {
+fn seen_at(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Vec<DirectionToPlace>> {
     let at = |ray: &Ray| {
         let weights = course.weights(ray.time_s + offset_s)?;
         Some((ray.direction, course.way.place(&weights)))
     };
-    let pairs: Vec<Seen> = rays.iter().filter_map(at).collect();
+    let pairs: Vec<DirectionToPlace> = rays.iter().filter_map(at).collect();
     let enough = LEAST_TRIED.max((LEAST_SHARE * rays.len() as f64) as usize);
     (pairs.len() >= enough).then_some(pairs)
 }
 
-impl Candidate {
-    fn of(map: &Linear, pairs: &[Seen], offset_s: f64) -> Option<Self> {
+impl StartPose {
+    fn of(map: &LinearMap, pairs: &[DirectionToPlace], offset_s: f64) -> Option<Self> {
         let (rotation, centre) = map.pose()?;
         let misfit = linear::typical(angles(pairs, &rotation, centre));
         Some(Self { rotation, centre, offset_s, misfit })
@@ -258,14 +258,14 @@ impl Candidate {
             let weights = course.weights(ray.time_s + self.offset_s)?;
             Some((ray.direction, course.way.place(&weights)))
         };
-        let seen: Vec<Seen> = rays(camera, piece).iter().filter_map(at).collect();
+        let seen: Vec<DirectionToPlace> = rays(camera, piece).iter().filter_map(at).collect();
         seen.is_empty() || linear::median(angles(&seen, &self.rotation, self.centre)) < near_rad
     }
 }
 
 /// Angles between directions and the places as seen by a camera of this pose, rad.
 fn angles(
-    pairs: &[Seen],
+    pairs: &[DirectionToPlace],
     rotation: &Rotation3<f64>,
     centre: Point3<f64>,
 ) -> impl Iterator<Item = f64> {
@@ -276,9 +276,9 @@ fn angles(
 
 /// Gauss-Newton refinement of pose and offset against the log's trajectory, with weights against
 /// outliers; `None` if too few rays fall into the course.
-fn refined(start: Candidate, rays: &[Ray], course: &Course, frame_s: f64) -> Option<Candidate> {
+fn refined(start: StartPose, rays: &[Ray], course: &Course, frame_s: f64) -> Option<StartPose> {
     const STEPS: usize = 25;
-    let mut best: Option<Candidate> = None;
+    let mut best: Option<StartPose> = None;
     let mut now = start;
     for _ in 0..STEPS {
         let scale = now.misfit.max(1e-4);

@@ -3,8 +3,8 @@
 use crossfix_geometry::Intrinsics;
 use nalgebra::{Vector2, Vector3};
 
-use super::model::{CameraLabels, CameraState, FlightLog, Knots, Label, Seen};
-use super::spline::{SPAN, Spline};
+use super::model::{CameraLabels, CameraUnknowns, FlightLog, Knots, Label, LabelResidual};
+use super::spline::{SPAN, TrajectorySpline};
 use super::unknowns::Order;
 use crate::label_noise::LabelNoise;
 use crate::lens::LensFreedom;
@@ -50,14 +50,14 @@ pub(super) struct CameraPriors {
 
 /// The unknowns.
 #[derive(Clone, Debug)]
-pub(super) struct State {
-    pub(super) way: Spline,
-    pub(super) cameras: Vec<CameraState>,
+pub(super) struct FlightState {
+    pub(super) way: TrajectorySpline,
+    pub(super) cameras: Vec<CameraUnknowns>,
     /// The log's bias, one per axis; empty without a log.
     pub(super) bias: Vec<Knots>,
 }
 
-impl State {
+impl FlightState {
     /// The order in which the unknowns stand.
     pub(super) fn order(&self) -> Order {
         Order::of(&self.way, self.cameras.len(), self.bias.len())
@@ -75,7 +75,7 @@ impl State {
     }
 
     pub(super) fn others(&self) -> usize {
-        self.cameras.iter().map(CameraState::own).sum()
+        self.cameras.iter().map(CameraUnknowns::own).sum()
     }
 
     pub(super) fn moved(&self, step: &[f64]) -> Self {
@@ -103,7 +103,11 @@ impl State {
     /// A label's residual with its derivatives, the spline's weights at its time and the first
     /// coefficient they belong to; `None` where the trajectory does not reach that time or the
     /// target lies behind the camera.
-    pub(super) fn see(&self, camera: usize, label: &Label) -> Option<(usize, [f64; SPAN], Seen)> {
+    pub(super) fn see(
+        &self,
+        camera: usize,
+        label: &Label,
+    ) -> Option<(usize, [f64; SPAN], LabelResidual)> {
         let camera = &self.cameras[camera];
         let weights = self.way.weights(camera.time_s(label))?;
         let seen = camera.see(label, self.way.place(&weights), self.way.velocity(&weights))?;

@@ -5,8 +5,8 @@ use nalgebra::{Rotation3, Vector3};
 
 use super::model::CameraLabels;
 use super::noise::Tails;
-use super::rows::{Row, Sink};
-use super::state::{Flight, State};
+use super::rows::{ResidualRow, Sink};
+use super::state::{Flight, FlightState};
 use crate::survey::ENOUGH_PLACES;
 
 /// Standard deviation of the tilt of a camera's image rows, as people set cameras up, rad. It makes
@@ -14,7 +14,7 @@ use crate::survey::ENOUGH_PLACES;
 /// believed.
 const LEVEL_RAD: f64 = 0.1;
 
-impl State {
+impl FlightState {
     /// A camera's surveyed place.
     pub(super) fn place_rows(
         &self,
@@ -29,7 +29,7 @@ impl State {
         if flight.known(index).is_some() {
             return;
         }
-        let rows = [0, 1, 2].map(|axis| -> Row {
+        let rows = [0, 1, 2].map(|axis| -> ResidualRow {
             let scale = place.sd_m[axis].recip();
             let aside = self.cameras[index].centre[axis] - place.position[axis];
             (vec![(start + 3 + axis, scale)], aside * scale)

@@ -11,7 +11,7 @@ use super::course::Course;
 use super::error::LEAST_LABELS;
 use super::model::frame_time;
 use super::model::{CameraLabels, Label};
-use super::pairs::{self, Pair, Sights};
+use super::pairs::{self, CameraPair, Sights};
 use super::{pieces, start, triangulation};
 use crate::survey::Survey;
 
@@ -93,7 +93,7 @@ impl<'a> Things<'a> {
 struct Joined {
     cameras: [usize; 2],
     pieces: [Vec<usize>; 2],
-    pair: Pair,
+    pair: CameraPair,
     labels: usize,
 }
 
@@ -145,7 +145,7 @@ fn seeds(things: &[Things<'_>], survey: &Survey) -> Vec<Joined> {
 }
 
 /// Possible relative poses of two cameras: from an earlier calibration, or from what they saw.
-fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> Vec<Pair> {
+fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> Vec<CameraPair> {
     match cameras.map(|camera| survey.known(&camera.name)) {
         [Some(a), Some(b)] => {
             let poses = [a, b].map(|known| known.camera.pose());

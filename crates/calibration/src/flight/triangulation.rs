@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
-use super::model::{CameraState, FlightLog, LogErrors, LogSample};
+use super::model::{CameraUnknowns, FlightLog, LogErrors, LogSample};
 use super::pairs::{LEAST_PARALLAX_RAD, Sights};
 
 /// Interval at which the target is placed, s.
@@ -13,7 +13,7 @@ const MOST_ASIDE_RAD: f64 = 0.02;
 const LEAST_ASIDE_RAD: f64 = 1e-3;
 
 /// The target's places as a log, by the cameras' common time.
-pub(super) fn log(cameras: &[(&Sights, &CameraState)]) -> FlightLog {
+pub(super) fn log(cameras: &[(&Sights, &CameraUnknowns)]) -> FlightLog {
     let spans = cameras.iter().filter_map(|(sights, state)| {
         let (from, to) = sights.span()?;
         Some((state.clock.common_s(from), state.clock.common_s(to)))
@@ -24,7 +24,7 @@ pub(super) fn log(cameras: &[(&Sights, &CameraState)]) -> FlightLog {
     let steps = ((to - from) / STEP_S).max(0.0) as usize;
     let placed = (0..steps).filter_map(|k| {
         let time_s = from + k as f64 * STEP_S;
-        let seen = |(sights, state): &(&Sights, &CameraState)| {
+        let seen = |(sights, state): &(&Sights, &CameraUnknowns)| {
             // At this stage clocks have neither rate nor wander.
             let direction = sights.at(time_s - state.clock.offset_s)?;
             Some((state.centre, state.rotation * direction))

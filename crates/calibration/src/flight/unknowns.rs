@@ -5,7 +5,7 @@
 //! of the log's bias) and goes on with the trajectory's coefficients up to the next knots. Unknowns
 //! that do not change with time follow.
 
-use super::spline::{IN_A_STEP, SPAN, Spline};
+use super::spline::{IN_A_STEP, SPAN, TrajectorySpline};
 
 /// Steps of the chain that one row may touch: trajectory and knots reach from a row's own step into
 /// the next one, and a clock's wander may have its knots in another step than the trajectory's.
@@ -22,7 +22,7 @@ pub(super) struct Order {
 
 impl Order {
     /// Order for a flight with this trajectory and this number of axes of a log's bias.
-    pub(super) fn of(way: &Spline, cameras: usize, axes: usize) -> Self {
+    pub(super) fn of(way: &TrajectorySpline, cameras: usize, axes: usize) -> Self {
         Self { cameras, axes, steps: way.coefficients.len() / IN_A_STEP }
     }
 

@@ -4,7 +4,7 @@ use super::model::FlightLog;
 use super::noise::Tails;
 use super::rows::Sink;
 use super::spline::{KNOT_S, SPAN, THIRD_DIFFERENCE};
-use super::state::{Priors, State};
+use super::state::{FlightState, Priors};
 
 /// Deviation of a coefficient's movement in one step of the adjustment where nothing else
 /// constrains the trajectory, m: near enough for ten minutes without a label. With a tenth of it a
@@ -12,7 +12,7 @@ use super::state::{Priors, State};
 /// 30 mrad.
 const REST_M: f64 = 1e5;
 
-impl State {
+impl FlightState {
     /// White jerk: its mean over an interval has the variance power / interval, so that the third
     /// difference has the variance power x interval^5.
     pub(super) fn jerk_rows(&self, priors: &Priors, sink: &mut impl Sink) {

@@ -4,7 +4,7 @@ use crossfix_geometry::turn_vector;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix6};
 
 use super::LandmarkPicture;
-use super::seen::{self, POSE, Seen, State};
+use super::seen::{self, ClickResidual, POSE, PoseAndLens};
 use crate::lens::{self, LensUncertainty};
 
 /// Steps at most: from a place that is wrong by half of the landmarks' range it takes fifteen.
@@ -19,8 +19,8 @@ const SAME: f64 = 25.0;
 
 /// State of least cost near a start.
 #[derive(Clone, Debug)]
-pub(super) struct Adjusted {
-    pub(super) state: State,
+pub(super) struct AdjustedCamera {
+    pub(super) state: PoseAndLens,
     /// Sum of squared residuals, in deviations, of clicks, lens and survey.
     pub(super) cost: f64,
     /// Covariance of rotation, centre and lens from the landmarks' independent errors.
@@ -29,7 +29,7 @@ pub(super) struct Adjusted {
     by_sky_turn: DMatrix<f64>,
 }
 
-impl Adjusted {
+impl AdjustedCamera {
     /// Whether another pose fits as well, and is a different one.
     pub(super) fn is_rivalled_by(&self, other: &Self) -> bool {
         if other.cost > self.cost + ALIKE {
@@ -68,7 +68,7 @@ struct Equations {
 }
 
 impl Equations {
-    fn at(picture: &LandmarkPicture, state: &State) -> Option<Self> {
+    fn at(picture: &LandmarkPicture, state: &PoseAndLens) -> Option<Self> {
         let count = POSE + lens::numbers(&state.intrinsics);
         let mut equations = Self {
             cost: 0.0,
@@ -79,7 +79,7 @@ impl Equations {
         for landmark in &picture.landmarks {
             let seen = seen::see(&landmark.at, landmark.pixel, state)?;
             let weight = seen.noise(landmark.click_sd_px).try_inverse()?;
-            let Seen { residual, by, .. } = seen;
+            let ClickResidual { residual, by, .. } = seen;
             equations.cost += residual.dot(&(weight * residual));
             equations.information += by.transpose() * weight * &by;
             equations.right -= by.transpose() * (weight * residual);
@@ -147,7 +147,7 @@ impl Scaled {
 }
 
 /// The best state near a start; `None` if none is found, or some unknown is not determined at all.
-pub(super) fn adjust(picture: &LandmarkPicture, start: State) -> Option<Adjusted> {
+pub(super) fn adjust(picture: &LandmarkPicture, start: PoseAndLens) -> Option<AdjustedCamera> {
     let mut state = start;
     let mut equations = Equations::at(picture, &state)?;
     let mut damping = 1e-3;
@@ -172,14 +172,14 @@ pub(super) fn adjust(picture: &LandmarkPicture, start: State) -> Option<Adjusted
     let covariance = Scaled::of(&equations.information)?.inverse();
     let by_sky_turn = by_sky_turn(picture, &state, &covariance)?;
     let is_finite = covariance.iter().chain(&by_sky_turn).all(|value| value.is_finite());
-    is_finite.then_some(Adjusted { state, cost: equations.cost, covariance, by_sky_turn })
+    is_finite.then_some(AdjustedCamera { state, cost: equations.cost, covariance, by_sky_turn })
 }
 
 /// Covariance that a common turn of all directions adds to the unknowns (consider covariance,
 /// Schmidt): the unknowns respond to the turn as they respond to the clicks that it moves.
 fn by_sky_turn(
     picture: &LandmarkPicture,
-    state: &State,
+    state: &PoseAndLens,
     covariance: &DMatrix<f64>,
 ) -> Option<DMatrix<f64>> {
     let mut pulled = DMatrix::zeros(covariance.nrows(), 3);

@@ -18,7 +18,7 @@ use crate::calibrated_camera::{CalibratedCamera, ClockCorrection, OverImage};
 use crate::label_noise::LabelNoise;
 use crate::lens::{LensFreedom, LensUncertainty};
 use crate::survey::{ENOUGH_FOR_POSE, LandmarkPlace, SurveyedPlace};
-use adjustment::Adjusted;
+use adjustment::AdjustedCamera;
 
 /// A landmark of known place or direction in a picture.
 #[derive(Clone, Debug)]
@@ -202,7 +202,7 @@ pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, 
         return Err(LandmarkError::TooFew { camera: camera.clone(), given, needed, is_surveyed });
     }
     let starts = start::starts(picture)?;
-    let mut found: Vec<Adjusted> =
+    let mut found: Vec<AdjustedCamera> =
         starts.into_iter().filter_map(|start| adjustment::adjust(picture, start)).collect();
     found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
     let none = || LandmarkError::NoSolution { camera: camera.clone() };
@@ -224,7 +224,7 @@ pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, 
 /// The landmarks without which the rest fits.
 fn suspects(
     picture: &LandmarkPicture,
-    (adjusted, result): (&Adjusted, &LandmarkResult),
+    (adjusted, result): (&AdjustedCamera, &LandmarkResult),
     needed: usize,
 ) -> Vec<String> {
     let without = |index: usize| {
@@ -253,7 +253,7 @@ fn suspects(
 /// calibration.
 const MOST_SUSPECTS: usize = 12;
 
-fn result(picture: &LandmarkPicture, adjusted: &Adjusted) -> Option<LandmarkResult> {
+fn result(picture: &LandmarkPicture, adjusted: &AdjustedCamera) -> Option<LandmarkResult> {
     let state = &adjusted.state;
     let pose = Pose::new(*state.rotation.matrix(), state.centre).ok()?;
     let (pose_covariance, lens) = adjusted.pose_and_lens()?;
@@ -289,7 +289,7 @@ const DISTANT_M: f64 = 1000.0;
 
 /// How a landmark fits, compared with what the others leave open: its own influence on the estimate
 /// is taken out of the residual's covariance.
-fn fit(landmark: &Landmark, adjusted: &Adjusted) -> Option<LandmarkFit> {
+fn fit(landmark: &Landmark, adjusted: &AdjustedCamera) -> Option<LandmarkFit> {
     let seen = seen::see(&landmark.at, landmark.pixel, &adjusted.state)?;
     let noise = seen.noise(landmark.click_sd_px);
     let by = &seen.by;

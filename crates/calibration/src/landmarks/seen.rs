@@ -13,13 +13,13 @@ pub(crate) const POSE: usize = 6;
 
 /// A camera's pose and lens.
 #[derive(Clone, Debug)]
-pub(crate) struct State {
+pub(crate) struct PoseAndLens {
     pub(crate) rotation: Rotation3<f64>,
     pub(crate) centre: Point3<f64>,
     pub(crate) intrinsics: Intrinsics,
 }
 
-impl State {
+impl PoseAndLens {
     pub(super) fn moved(&self, step: &DVector<f64>) -> Self {
         Self {
             rotation: self.rotation * Rotation3::new(step.fixed_rows::<3>(0).into_owned()),
@@ -31,7 +31,7 @@ impl State {
 
 /// A click, compared with where a state has the landmark.
 #[derive(Clone, Debug)]
-pub(crate) struct Seen {
+pub(crate) struct ClickResidual {
     /// The predicted pixel less the click, pixels.
     pub(crate) residual: Vector2<f64>,
     /// Derivatives by pose and lens.
@@ -43,7 +43,7 @@ pub(crate) struct Seen {
     pub(crate) by_sky_turn: Matrix2x3<f64>,
 }
 
-impl Seen {
+impl ClickResidual {
     /// Covariance of the click, with that due to the landmark's own place, pixels^2.
     pub(crate) fn noise(&self, click_sd_px: f64) -> Matrix2<f64> {
         self.by_place * self.by_place.transpose() + Matrix2::identity() * click_sd_px.powi(2)
@@ -51,7 +51,11 @@ impl Seen {
 }
 
 /// A landmark as a state sees it, compared with its click; `None` behind the camera.
-pub(crate) fn see(at: &LandmarkPlace, clicked: Pixel, state: &State) -> Option<Seen> {
+pub(crate) fn see(
+    at: &LandmarkPlace,
+    clicked: Pixel,
+    state: &PoseAndLens,
+) -> Option<ClickResidual> {
     let camera_from_world = state.rotation.inverse();
     let offset = match at {
         LandmarkPlace::Place { position, .. } => camera_from_world * (position - state.centre),
@@ -76,5 +80,5 @@ pub(crate) fn see(at: &LandmarkPlace, clicked: Pixel, state: &State) -> Option<S
         by.set_column(POSE + number, by_number);
     }
     let residual = seen.pixel - Vector2::new(clicked.x(), clicked.y());
-    Some(Seen { residual, by, by_place, by_sky_turn })
+    Some(ClickResidual { residual, by, by_place, by_sky_turn })
 }

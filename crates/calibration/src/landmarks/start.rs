@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
-use super::seen::State;
+use super::seen::PoseAndLens;
 use super::{LandmarkError, LandmarkPicture};
 use crate::lens;
 use crate::survey::LandmarkPlace;
@@ -16,7 +16,7 @@ const DISTANCES: [f64; 5] = [0.4, 0.7, 1.0, 1.4, 2.0];
 const ADJUSTED: usize = 40;
 
 /// Poses to adjust from. For each place the rotation that fits best is known in closed form.
-pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<State>, LandmarkError> {
+pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<PoseAndLens>, LandmarkError> {
     let mut clicked = Vec::with_capacity(picture.landmarks.len());
     for landmark in &picture.landmarks {
         let direction = lens::direction(&picture.intrinsics, landmark.pixel).ok_or_else(|| {
@@ -27,7 +27,7 @@ pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<State>, LandmarkEr
         })?;
         clicked.push((direction.normalize(), landmark.at));
     }
-    let state = |(rotation, centre): (Rotation3<f64>, Point3<f64>)| State {
+    let state = |(rotation, centre): (Rotation3<f64>, Point3<f64>)| PoseAndLens {
         rotation,
         centre,
         intrinsics: picture.intrinsics,

@@ -6,7 +6,7 @@ use crossfix_vision::TrackerConfig;
 use nalgebra::Vector3;
 
 use crate::calibrated;
-use crate::config::{self, CameraFile, Kind, Site, load_network};
+use crate::config::{self, CameraFile, FileKind, SiteFolder, load_network};
 use crate::output;
 #[cfg(not(feature = "centre"))]
 use crate::parts;
@@ -30,7 +30,7 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     if args.config.is_dir() {
-        let site = Site::load(&args.config)?;
+        let site = SiteFolder::load(&args.config)?;
         for (name, checked) in &site.cameras {
             output::line(format!(
                 "camera `{name}`: {} is good; {}",
@@ -51,18 +51,18 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
         return Ok(());
     }
-    let keys: toml::Table = config::load(&args.config, &[], Kind::Fusion)?;
-    let resolved = match Kind::of(&keys) {
-        Some(Kind::Camera) => check_camera(args)?,
-        Some(Kind::Network) => toml::to_string(&load_network(&args.config)?)?,
-        Some(Kind::Tracker) => {
-            let tracker: TrackerConfig = config::load(&args.config, &args.sets, Kind::Tracker)?;
+    let keys: toml::Table = config::load(&args.config, &[], FileKind::Fusion)?;
+    let resolved = match FileKind::of(&keys) {
+        Some(FileKind::Camera) => check_camera(args)?,
+        Some(FileKind::Network) => toml::to_string(&load_network(&args.config)?)?,
+        Some(FileKind::Tracker) => {
+            let tracker: TrackerConfig = config::load(&args.config, &args.sets, FileKind::Tracker)?;
             tracker
                 .validate()
                 .with_context(|| format!("{} has an error", args.config.display()))?;
             toml::to_string(&tracker)?
         }
-        Some(Kind::Calibration) => {
+        Some(FileKind::Calibration) => {
             let site = calibrated::load(&args.config)?;
             let names: Vec<&str> = site.cameras().iter().map(|c| c.name.as_str()).collect();
             output::line(format!(
@@ -73,9 +73,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             return Ok(());
         }
         #[cfg(feature = "centre")]
-        Some(Kind::Scene) => check_scene(args)?,
+        Some(FileKind::Scene) => check_scene(args)?,
         #[cfg(feature = "centre")]
-        Some(Kind::Fusion) | None => check_fusion(args)?,
+        Some(FileKind::Fusion) | None => check_fusion(args)?,
         #[cfg(not(feature = "centre"))]
         kind => {
             let kind =
@@ -89,7 +89,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 #[cfg(feature = "centre")]
 fn check_scene(args: &Args) -> anyhow::Result<String> {
-    let scene: crossfix_simulation::Scene = config::load(&args.config, &args.sets, Kind::Scene)?;
+    let scene: crossfix_simulation::Scene =
+        config::load(&args.config, &args.sets, FileKind::Scene)?;
     scene.build().with_context(|| format!("the scene {} has an error", args.config.display()))?;
     Ok(toml::to_string(&scene)?)
 }

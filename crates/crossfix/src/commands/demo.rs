@@ -138,7 +138,7 @@ impl Drop for Component {
 }
 
 /// The demo's files.
-struct Files {
+struct DemoFiles {
     folder: PathBuf,
     network: PathBuf,
     fusion: PathBuf,
@@ -215,7 +215,7 @@ enum Ending {
 /// Starts all components, follows the run to its end, and stops them.
 fn play(
     args: &Args,
-    files: &Files,
+    files: &DemoFiles,
     network: &NetworkConfig,
     shutdown: &Shutdown,
 ) -> anyhow::Result<Ending> {
@@ -407,10 +407,10 @@ fn write_files(
     world: &World,
     network: &NetworkConfig,
     streams: Option<Streams>,
-) -> anyhow::Result<Files> {
+) -> anyhow::Result<DemoFiles> {
     std::fs::create_dir_all(folder.join("logs"))
         .with_context(|| format!("cannot make {}", folder.display()))?;
-    let mut files = Files {
+    let mut files = DemoFiles {
         folder: folder.to_owned(),
         network: folder.join("network.toml"),
         fusion: folder.join("fusion.toml"),

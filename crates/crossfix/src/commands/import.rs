@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use crossfix_recording::RecordingWriter;
 
-use crate::import::drone_tracking::{Part, Sample};
+use crate::import::drone_tracking::{Sample, SplitPart};
 use crate::import::{drone_tracking, scenario};
 use crate::output::{self, Draft};
 
@@ -40,7 +40,7 @@ enum Source {
         split: String,
         /// Which part of the split.
         #[arg(long, default_value = "test", value_enum, value_name = "PART")]
-        part: Part,
+        part: SplitPart,
         /// As the cameras recorded it: times counted by frames, the lenses of their files, and no
         /// poses.
         #[arg(long)]

@@ -60,13 +60,13 @@ pub enum Command {
     View(view::Args),
     #[cfg(feature = "centre")]
     #[command(flatten)]
-    Centre(Centre),
+    Centre(CentreCommand),
 }
 
 /// What the fusion centre does, and whoever judges or plans a site.
 #[cfg(feature = "centre")]
 #[derive(Debug, Subcommand)]
-pub enum Centre {
+pub enum CentreCommand {
     Fuse(fuse::Args),
     Replay(replay::Args),
     Import(import::Args),
@@ -81,7 +81,7 @@ pub enum Centre {
 }
 
 #[cfg(feature = "centre")]
-impl Centre {
+impl CentreCommand {
     fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Fuse(args) => fuse::run(&args),

@@ -76,7 +76,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
-    let scene: Scene = config::load(path, &args.sets, config::Kind::Scene)?;
+    let scene: Scene = config::load(path, &args.sets, config::FileKind::Scene)?;
     let world =
         scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
     let noise = args.noise_px;

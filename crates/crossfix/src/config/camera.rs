@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::mount::MountConfig;
 use super::pose::PoseConfig;
-use super::{Kind, SourceConfig};
+use super::{FileKind, SourceConfig};
 use crate::calibrated::Calibrated;
 use crate::recorded;
 
@@ -138,7 +138,7 @@ impl Default for PreviewConfig {
 impl CameraFile {
     /// Reads the file and resolves its paths against the file's folder.
     pub fn load(path: &Path, sets: &[String]) -> anyhow::Result<Self> {
-        let mut file: Self = super::load(path, sets, Kind::Camera)?;
+        let mut file: Self = super::load(path, sets, FileKind::Camera)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         file.network = folder.join(&file.network);
         file.intrinsics = file.intrinsics.map(|intrinsics| folder.join(intrinsics));
@@ -347,7 +347,7 @@ impl CameraFile {
         match &self.source {
             SourceConfig::Video { rate_hz, .. } => Ok(Some(*rate_hz)),
             SourceConfig::Simulation { scene, .. } => {
-                let scene: Scene = super::load(scene, &[], Kind::Scene)?;
+                let scene: Scene = super::load(scene, &[], FileKind::Scene)?;
                 let named = |camera: &&SceneCamera| camera.name == self.name;
                 Ok(scene.cameras.iter().find(named).map(|camera| camera.rate_hz))
             }

@@ -11,11 +11,15 @@ const SIMILAR: f64 = 0.6;
 ///
 /// The error names the file, the line, the key and, for an unknown key, the nearest known one. If
 /// the file is of another kind than `wanted`, the error says which.
-pub fn load<T: DeserializeOwned>(path: &Path, sets: &[String], wanted: Kind) -> anyhow::Result<T> {
+pub fn load<T: DeserializeOwned>(
+    path: &Path,
+    sets: &[String],
+    wanted: FileKind,
+) -> anyhow::Result<T> {
     let text = std::fs::read_to_string(path)
         .with_context(|| format!("cannot read the configuration file {}", path.display()))?;
     parse(&text, sets).or_else(|error| {
-        let kind = toml::from_str(&text).ok().and_then(|keys| Kind::of(&keys));
+        let kind = toml::from_str(&text).ok().and_then(|keys| FileKind::of(&keys));
         match kind.filter(|kind| *kind != wanted) {
             Some(kind) => {
                 bail!("{} is {kind}, and what is wanted here is {wanted}", path.display())
@@ -28,7 +32,7 @@ pub fn load<T: DeserializeOwned>(path: &Path, sets: &[String], wanted: Kind) -> 
 
 /// Kind of a configuration file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum FileKind {
     Camera,
     Fusion,
     Network,
@@ -37,7 +41,7 @@ pub enum Kind {
     Calibration,
 }
 
-impl Kind {
+impl FileKind {
     /// Kind of a file by its keys; `None` if they do not tell.
     pub fn of(keys: &toml::Table) -> Option<Self> {
         let has = |names: &[&str]| names.iter().any(|name| keys.contains_key(*name));
@@ -60,7 +64,7 @@ impl Kind {
     }
 }
 
-impl fmt::Display for Kind {
+impl fmt::Display for FileKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Camera => "a camera's file",
@@ -176,19 +180,19 @@ mod tests {
     fn a_file_of_another_kind_is_named_as_what_it_is() {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/");
         let kinds = [
-            ("site/north.toml", Kind::Camera),
-            ("site/fusion.toml", Kind::Fusion),
-            ("site/network.toml", Kind::Network),
-            ("demo/scene.toml", Kind::Scene),
-            ("paper-tracker.toml", Kind::Tracker),
+            ("site/north.toml", FileKind::Camera),
+            ("site/fusion.toml", FileKind::Fusion),
+            ("site/network.toml", FileKind::Network),
+            ("demo/scene.toml", FileKind::Scene),
+            ("paper-tracker.toml", FileKind::Tracker),
         ];
         for (name, kind) in kinds {
             let path = Path::new(folder).join(name);
             let keys = toml::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
-            assert_eq!(Kind::of(&keys), Some(kind), "{name}");
-            if kind != Kind::Fusion {
+            assert_eq!(FileKind::of(&keys), Some(kind), "{name}");
+            if kind != FileKind::Fusion {
                 let error =
-                    load::<crate::config::FusionFile>(&path, &[], Kind::Fusion).unwrap_err();
+                    load::<crate::config::FusionFile>(&path, &[], FileKind::Fusion).unwrap_err();
                 let says = format!("is {kind}, and what is wanted here is a fusion centre's file");
                 assert!(error.to_string().contains(&says), "{error}");
             }

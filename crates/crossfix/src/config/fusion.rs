@@ -35,7 +35,7 @@ impl FusionFile {
         let Some(path) = path else {
             return super::parse("", sets);
         };
-        let mut file: Self = super::load(path, sets, super::Kind::Fusion)?;
+        let mut file: Self = super::load(path, sets, super::FileKind::Fusion)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         file.network = file.network.map(|network| folder.join(network));
         file.fusion()

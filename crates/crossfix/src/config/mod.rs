@@ -11,12 +11,12 @@ mod source;
 mod stream;
 
 pub use camera::{CameraFile, ClockConfig, ClockSourceName};
-pub use file::{Kind, load, parse};
+pub use file::{FileKind, load, parse};
 #[cfg(feature = "centre")]
 pub use fusion::FusionFile;
 pub use mount::{MountConfig, OnvifConfig};
 pub use pose::PoseConfig;
-pub use site::{Site, anchor_of, load_cameras, load_network};
+pub use site::{SiteFolder, anchor_of, load_cameras, load_network};
 pub use source::SourceConfig;
 pub use stream::{GstreamerConfig, StreamConfig, login};
 

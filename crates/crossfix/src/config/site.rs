@@ -9,12 +9,12 @@ use crossfix_transport::{Anchor, Credentials, Identity, NetworkConfig};
 
 #[cfg(feature = "centre")]
 use super::FusionFile;
-use super::{CameraFile, Kind};
+use super::{CameraFile, FileKind};
 use crate::calibrated;
 
 /// Reads and checks a network file.
 pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
-    let mut network: NetworkConfig = super::load(path, &[], Kind::Network)?;
+    let mut network: NetworkConfig = super::load(path, &[], FileKind::Network)?;
     if let Some(security) = &mut network.security {
         let folder = path.parent().unwrap_or(Path::new("."));
         security.certificates = folder.join(&security.certificates);
@@ -55,7 +55,7 @@ fn toml_files(folder: &Path) -> anyhow::Result<Vec<(PathBuf, toml::Table)>> {
 }
 
 fn is_camera(keys: &toml::Table) -> bool {
-    Kind::of(keys) == Some(Kind::Camera)
+    FileKind::of(keys) == Some(FileKind::Camera)
 }
 
 /// The camera files of a folder, whether or not the rest of the site exists yet.
@@ -71,7 +71,7 @@ pub fn load_cameras(folder: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>>
 }
 
 /// A folder with the files of a site: what `check` looks at as a whole.
-pub struct Site {
+pub struct SiteFolder {
     pub cameras: BTreeMap<CameraName, CheckedCamera>,
     pub fusion: Vec<PathBuf>,
     /// Identities whose certificates are in the network's folder, with the days each is still
@@ -86,20 +86,20 @@ pub struct CheckedCamera {
     network: NetworkConfig,
 }
 
-impl Site {
+impl SiteFolder {
     /// Reads every TOML file of a folder and checks that they fit together.
     pub fn load(folder: &Path) -> anyhow::Result<Self> {
         let mut site =
             Self { cameras: BTreeMap::new(), fusion: Vec::new(), certificates: BTreeMap::new() };
         let mut fusion = Vec::new();
         for (path, keys) in toml_files(folder)? {
-            match Kind::of(&keys) {
-                Some(Kind::Camera) => site.add_camera(&path)?,
-                Some(Kind::Network) => site.add_certificates(&load_network(&path)?)?,
-                Some(Kind::Calibration) => drop(calibrated::load(&path)?),
+            match FileKind::of(&keys) {
+                Some(FileKind::Camera) => site.add_camera(&path)?,
+                Some(FileKind::Network) => site.add_certificates(&load_network(&path)?)?,
+                Some(FileKind::Calibration) => drop(calibrated::load(&path)?),
                 // A scene of the simulator, or a tracker's settings.
-                Some(Kind::Scene | Kind::Tracker) => {}
-                Some(Kind::Fusion) | None => fusion.push(path),
+                Some(FileKind::Scene | FileKind::Tracker) => {}
+                Some(FileKind::Fusion) | None => fusion.push(path),
             }
         }
         ensure!(!site.cameras.is_empty(), "{} holds no camera file", folder.display());

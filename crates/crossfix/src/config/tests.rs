@@ -104,11 +104,11 @@ const ODD: &[&str] = &[
 ];
 
 /// Reads and checks a file as far as that goes without opening a source.
-fn read(kind: Kind, text: &str) -> anyhow::Result<()> {
+fn read(kind: FileKind, text: &str) -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("file.toml");
     std::fs::write(&path, text)?;
-    if kind == Kind::Network {
+    if kind == FileKind::Network {
         let network = load_network(&path)?;
         for (area, _) in network.centres() {
             let _ = network.cameras_of(area.as_ref());
@@ -122,19 +122,19 @@ fn read(kind: Kind, text: &str) -> anyhow::Result<()> {
     file.described(&path).map(|_| ())
 }
 
-fn any_file() -> impl Strategy<Value = (Kind, &'static str)> {
-    let cameras = CAMERAS.iter().map(|text| (Kind::Camera, *text));
-    let networks = NETWORKS.iter().map(|text| (Kind::Network, *text));
+fn any_file() -> impl Strategy<Value = (FileKind, &'static str)> {
+    let cameras = CAMERAS.iter().map(|text| (FileKind::Camera, *text));
+    let networks = NETWORKS.iter().map(|text| (FileKind::Network, *text));
     select(cameras.chain(networks).collect::<Vec<_>>())
 }
 
 #[test]
 fn each_is_read_as_far_as_the_other_files_are_there() {
     for text in NETWORKS {
-        read(Kind::Network, text).unwrap();
+        read(FileKind::Network, text).unwrap();
     }
     for text in CAMERAS {
-        let words = format!("{:#}", read(Kind::Camera, text).unwrap_err());
+        let words = format!("{:#}", read(FileKind::Camera, text).unwrap_err());
         let lacks = ["cannot read", "cannot open", "give both `intrinsics`", "key `calibration`"];
         assert!(lacks.iter().any(|lack| words.contains(lack)), "{words}");
     }
@@ -162,6 +162,6 @@ proptest! {
 
     #[test]
     fn any_text_is_survived(text in "\\PC{0,200}") {
-        prop_assert!(read(Kind::Camera, &text).is_err() && read(Kind::Network, &text).is_err());
+        prop_assert!(read(FileKind::Camera, &text).is_err() && read(FileKind::Network, &text).is_err());
     }
 }

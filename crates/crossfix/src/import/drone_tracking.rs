@@ -34,7 +34,7 @@ pub struct Selection<'a> {
     pub dataset: u32,
     pub cameras: &'a [String],
     pub split: &'a str,
-    pub part: Part,
+    pub part: SplitPart,
     /// Data as the cameras recorded them: times by their own counts of frames, lenses by their
     /// files, no poses.
     pub is_raw: bool,
@@ -42,7 +42,7 @@ pub struct Selection<'a> {
 
 /// A part of a split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum Part {
+pub enum SplitPart {
     /// That to which the poses of poses.json were fitted.
     Calibration,
     /// The rest.
@@ -52,7 +52,7 @@ pub enum Part {
 }
 
 /// What was read from the data set.
-pub struct Flight {
+pub struct ImportedFlight {
     pub entries: Vec<Entry>,
     /// The drone's positions by RTK, errors included.
     pub log: Vec<Sample>,
@@ -94,7 +94,7 @@ struct LensFile {
 }
 
 /// One row of a label file: a frame, and the drone's pixel if the drone is in it.
-struct Label {
+struct ImportedLabel {
     frame: u64,
     pixel: Option<Pixel>,
 }
@@ -135,7 +135,7 @@ impl LensFile {
     }
 }
 
-impl Part {
+impl SplitPart {
     fn holds(self, split: &Split, rtk_seconds: f64) -> bool {
         let index = rtk_seconds * RTK_RATE;
         let within =
@@ -168,7 +168,7 @@ fn parse_json<T: serde::de::DeserializeOwned>(path: &Path) -> anyhow::Result<T> 
 }
 
 /// Reads a part of a split: calibrations, bearings of every frame, truth.
-pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Flight> {
+pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<ImportedFlight> {
     let site: SiteName = format!("drone-tracking-{}", selection.dataset).parse()?;
     let poses = dir.join("poses.json");
     let mut all: BTreeMap<String, serde_json::Value> = parse_json(&poses)?;
@@ -201,10 +201,10 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Flight> {
         let source = CameraSource { site: &site, fitted, lens: &lens, is_raw: selection.is_raw };
         entries.extend(source.entries(&labels, is_wanted)?);
     }
-    Ok(Flight { entries, log })
+    Ok(ImportedFlight { entries, log })
 }
 
-fn read_labels(path: &Path) -> anyhow::Result<Vec<Label>> {
+fn read_labels(path: &Path) -> anyhow::Result<Vec<ImportedLabel>> {
     let text = read_text(path)?;
     let starts_with_digit = |line: &&str| line.starts_with(|c: char| c.is_ascii_digit());
     text.lines()
@@ -217,7 +217,7 @@ fn read_labels(path: &Path) -> anyhow::Result<Vec<Label>> {
                 bail!("{}: `{line}` is not `frame x y`", path.display());
             };
             let visible = x != 0.0 || y != 0.0;
-            Ok(Label { frame: frame as u64, pixel: visible.then(|| Pixel::new(x, y)) })
+            Ok(ImportedLabel { frame: frame as u64, pixel: visible.then(|| Pixel::new(x, y)) })
         })
         .collect()
 }
@@ -234,7 +234,7 @@ impl CameraSource<'_> {
     /// The camera's calibration, and its bearings of the frames whose RTK time is wanted.
     fn entries(
         &self,
-        labels: &[Label],
+        labels: &[ImportedLabel],
         is_wanted: impl Fn(f64) -> bool,
     ) -> anyhow::Result<Vec<Entry>> {
         let name: CameraName = self.fitted.name.parse()?;
@@ -414,7 +414,7 @@ mod tests {
             "residual_sigma_rad": 0.001,
         }))
         .unwrap();
-        let label = |frame, x, y| Label { frame, pixel: Some(Pixel::new(x, y)) };
+        let label = |frame, x, y| ImportedLabel { frame, pixel: Some(Pixel::new(x, y)) };
         let labels = [label(0, 960.0, 540.0), label(1, 3.0, 3.0), label(2, 1000.0, 500.0)];
         let site = "test".parse().unwrap();
         let source = CameraSource { site: &site, fitted: &fitted, lens: &lens, is_raw: false };

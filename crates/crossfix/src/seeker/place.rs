@@ -6,14 +6,14 @@ use nalgebra::{Matrix2, Rotation3, SymmetricEigen, Unit, Vector2, Vector3};
 
 /// Predicted direction at a time, with covariance, in the camera's frame at rest.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Place {
+pub(super) struct PredictedDirection {
     pub(super) direction: Unit<Vector3<f64>>,
     /// Covariance along the tangents of the direction, rad^2.
     pub(super) covariance: Matrix2<f64>,
 }
 
 /// Long axis of the error ellipse, and its standard deviation, rad.
-pub(super) fn long_axis(place: &Place) -> (Vector3<f64>, f64) {
+pub(super) fn long_axis(place: &PredictedDirection) -> (Vector3<f64>, f64) {
     let axes = SymmetricEigen::new(place.covariance);
     let (index, variance) = axes.eigenvalues.argmax();
     let axis = tangent_basis(&place.direction) * axes.eigenvectors.column(index);
@@ -23,7 +23,7 @@ pub(super) fn long_axis(place: &Place) -> (Vector3<f64>, f64) {
 /// Squared Mahalanobis distance of a track from the predicted place, d^2 = e' (P + R)^-1 e;
 /// `turned` rotates the camera's frame to its frame at rest.
 pub(super) fn squared_distance(
-    expected: &Place,
+    expected: &PredictedDirection,
     turned: &Rotation3<f64>,
     track: &BearingTrack,
 ) -> Option<f64> {
@@ -44,7 +44,7 @@ pub(super) fn squared_distance(
 }
 
 /// A cue's prediction at a time, interpolated between the times that it states.
-pub(super) fn place_at(cue: &Cue, time: Timestamp) -> Option<Place> {
+pub(super) fn place_at(cue: &Cue, time: Timestamp) -> Option<PredictedDirection> {
     let seconds = |one: &Expected| Timestamp::from_nanos(one.time_ns).seconds_since(time);
     let after = cue.ahead.iter().position(|one| seconds(one) >= 0.0);
     let after = after.unwrap_or(cue.ahead.len().checked_sub(1)?).max(1);
@@ -57,14 +57,14 @@ pub(super) fn place_at(cue: &Cue, time: Timestamp) -> Option<Place> {
     let share = share.clamp(0.0, 1.5);
     let turn = turn_between(&from.direction, &to.direction)?;
     let part = Rotation3::new(turn_vector(&turn) * share);
-    Some(Place {
+    Some(PredictedDirection {
         direction: part * from.direction,
         covariance: from.covariance * (1.0 - share.min(1.0)) + to.covariance * share.min(1.0),
     })
 }
 
-fn read(expected: &Expected) -> Option<Place> {
+fn read(expected: &Expected) -> Option<PredictedDirection> {
     let [xx, xy, yy] = [expected.covariance_xx, expected.covariance_xy, expected.covariance_yy];
     let bearing = Bearing::new(expected.bearing?.into(), Matrix2::new(xx, xy, xy, yy)).ok()?;
-    Some(Place { direction: bearing.direction(), covariance: *bearing.covariance() })
+    Some(PredictedDirection { direction: bearing.direction(), covariance: *bearing.covariance() })
 }

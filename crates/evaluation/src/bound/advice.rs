@@ -4,7 +4,7 @@ use crossfix_geometry::{Camera, Pose};
 use nalgebra::{Matrix6, Point3, Vector2, Vector3};
 use serde::Serialize;
 
-use super::plan::{Observer, accuracy, prior};
+use super::plan::{PlannedObserver, accuracy, prior};
 use super::{Assumptions, FisherInformation, PlannedCamera, Volume};
 
 /// Radii of the candidates' rings, relative to the cameras' median distance from the volume's
@@ -30,7 +30,7 @@ pub struct Score {
 
 /// A place for one more camera.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Candidate {
+pub struct CandidatePlace {
     /// The place, ENU, m.
     pub position_m: [f64; 3],
     /// The score with it.
@@ -47,18 +47,18 @@ pub struct Advice {
     /// The score of the present cameras.
     pub now: Score,
     /// The candidates, the best first.
-    pub candidates: Vec<Candidate>,
+    pub candidates: Vec<CandidatePlace>,
 }
 
 impl Advice {
     /// The best `count` candidates that are at least `apart_m` apart, m: neighbours are about
     /// equally good.
-    pub fn best_apart(&self, count: usize, apart_m: f64) -> Vec<Candidate> {
-        let mut best: Vec<Candidate> = Vec::new();
+    pub fn best_apart(&self, count: usize, apart_m: f64) -> Vec<CandidatePlace> {
+        let mut best: Vec<CandidatePlace> = Vec::new();
         for candidate in &self.candidates {
             let place = Point3::from(candidate.position_m);
             let apart =
-                |other: &Candidate| (Point3::from(other.position_m) - place).norm() >= apart_m;
+                |other: &CandidatePlace| (Point3::from(other.position_m) - place).norm() >= apart_m;
             if best.len() < count && best.iter().all(apart) {
                 best.push(*candidate);
             }
@@ -78,19 +78,19 @@ fn score(deviations: &mut [f64], fixed: usize) -> Score {
 }
 
 /// A cube of the sample with the present cameras' information on a target in it.
-struct Known {
+struct KnownCube {
     point: Point3<f64>,
     cameras: usize,
     information: FisherInformation,
 }
 
-fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<Known> {
+fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<KnownCube> {
     // Phases as if the candidate were the last of the list.
     let phase = |index: usize| index as f64 / (cameras.len() + 1) as f64;
-    let observers: Vec<Observer> = cameras
+    let observers: Vec<PlannedObserver> = cameras
         .iter()
         .enumerate()
-        .map(|(index, camera)| Observer::new(camera, phase(index), assumptions))
+        .map(|(index, camera)| PlannedObserver::new(camera, phase(index), assumptions))
         .collect();
     let stride = volume.centres().count().div_ceil(SAMPLE).max(1);
     let known = |(_, point): (usize, Point3<f64>)| {
@@ -98,12 +98,12 @@ fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) 
             observers.iter().filter_map(|o| o.information(point)).collect();
         let mut information = prior(assumptions);
         theirs.iter().for_each(|one| information += one);
-        Known { point, cameras: theirs.len(), information }
+        KnownCube { point, cameras: theirs.len(), information }
     };
     volume.centres().step_by(stride).map(known).collect()
 }
 
-fn score_with(known: &[Known], extra: Option<&Observer>, worst_m: f64) -> Score {
+fn score_with(known: &[KnownCube], extra: Option<&PlannedObserver>, worst_m: f64) -> Score {
     let mut fixed = 0;
     let mut deviations: Vec<f64> = known
         .iter()
@@ -155,11 +155,11 @@ pub fn advise(
         let pose_covariance = carried(like, &camera);
         let more = PlannedCamera { camera, pose_covariance, ..like.clone() };
         let phase = cameras.len() as f64 / (cameras.len() + 1) as f64;
-        let observer = Observer::new(&more, phase, assumptions);
+        let observer = PlannedObserver::new(&more, phase, assumptions);
         let score = score_with(&known, Some(&observer), worst_m);
-        Some(Candidate { position_m: place.into(), score })
+        Some(CandidatePlace { position_m: place.into(), score })
     };
-    let mut candidates: Vec<Candidate> = RINGS
+    let mut candidates: Vec<CandidatePlace> = RINGS
         .into_iter()
         .flat_map(|ring| (0..DIRECTIONS).map(move |direction| (ring, direction)))
         .filter_map(|(ring, direction)| candidate(ring, direction))

@@ -7,7 +7,7 @@ mod plan;
 mod summary;
 mod volume;
 
-pub use advice::{Advice, Candidate, Score, advise};
+pub use advice::{Advice, CandidatePlace, Score, advise};
 pub use information::{
     BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets,
 };

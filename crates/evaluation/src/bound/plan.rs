@@ -138,7 +138,7 @@ pub struct Cell {
 }
 
 /// A camera with the times of its bearings.
-pub(super) struct Observer<'a> {
+pub(super) struct PlannedObserver<'a> {
     camera: &'a Camera,
     times: TimeOffsets,
     reach_m: f64,
@@ -146,7 +146,7 @@ pub(super) struct Observer<'a> {
     noise: PixelCovariance,
 }
 
-impl<'a> Observer<'a> {
+impl<'a> PlannedObserver<'a> {
     /// A camera whose newest bearing is `phase` of its frame interval old; at least one bearing is
     /// in the window.
     pub(super) fn new(
@@ -201,10 +201,10 @@ pub(super) fn accuracy(cameras: usize, information: &FisherInformation) -> Optio
 /// The cameras are not synchronised: their phases are spread evenly.
 pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<Cell> {
     let phase = |index: usize| index as f64 / cameras.len() as f64;
-    let observers: Vec<Observer> = cameras
+    let observers: Vec<PlannedObserver> = cameras
         .iter()
         .enumerate()
-        .map(|(index, camera)| Observer::new(camera, phase(index), assumptions))
+        .map(|(index, camera)| PlannedObserver::new(camera, phase(index), assumptions))
         .collect();
     let cell = |(layer, centre): (usize, Point3<f64>)| {
         let mut information = prior(assumptions);

@@ -5,7 +5,7 @@ use crossfix_vision::{ImmConfig, PixelImm};
 
 use super::ValidationOptions;
 use super::runs::{self, Noise};
-use super::table::{Limit, Row, Table, mean};
+use super::table::{Limit, Table, TableRow, mean};
 
 /// Number of frames of an experiment, and their interval, s.
 const FRAMES: usize = 1000;
@@ -18,14 +18,14 @@ const CHEAP: usize = 2;
 /// Parameters of an experiment: rate of the brightness jumps, 1/s; SD of the jumps and of the
 /// noise, levels.
 #[derive(Clone, Copy)]
-struct Cell {
+struct JumpCase {
     rate: f64,
     jump: f64,
     noise: f64,
 }
 
 /// Mean absolute errors (Solonar 2023, eqs. 17-19) of the filter and of the smoothing in one run.
-fn errors(seed: u64, run: usize, cell: Cell) -> [f64; 2] {
+fn errors(seed: u64, run: usize, cell: JumpCase) -> [f64; 2] {
     let mut random = Noise::new(seed, run);
     let mut truth = 128.0;
     let first = truth + cell.noise * random.normal();
@@ -54,7 +54,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         [(5.0, 60.0, [2.14, 3.21]), (5.0, 30.0, [2.14, 3.21]), (15.0, 60.0, [1.53, 2.17])]
     {
         for rate in [0.1, 0.3, 0.5, 0.7, 0.9] {
-            let cell = Cell { rate, jump, noise };
+            let cell = JumpCase { rate, jump, noise };
             let samples = runs::all(CHEAP * options.runs, |run| errors(options.seed, run, cell));
             let of = |i: usize| mean(&samples.iter().map(|s| s[i]).collect::<Vec<_>>());
             let (filter, smoothing) = (of(0), of(1));
@@ -65,18 +65,18 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                 (5, 60, 9) => Some(1.47),
                 _ => None,
             };
-            let row = Row::new(format!("IMM, {name}"), rate, filter);
-            rows.push(Row {
+            let row = TableRow::new(format!("IMM, {name}"), rate, filter);
+            rows.push(TableRow {
                 limit: asked.map(|value| Limit::Near { value, tolerance: 0.1 * value }),
                 ..row
             });
-            rows.push(Row::new(format!("smoothing, {name}"), rate, smoothing));
+            rows.push(TableRow::new(format!("smoothing, {name}"), rate, smoothing));
             let ratio = smoothing.0 / filter.0;
             let relative = (filter.1 / filter.0).hypot(smoothing.1 / smoothing.0);
-            let row = Row::new(name, rate, (ratio, ratio * relative));
+            let row = TableRow::new(name, rate, (ratio, ratio * relative));
             let paper = (rate == 0.1).then_some(claimed[0]).or((rate == 0.9).then_some(claimed[1]));
             let limit = asked.map(|_| Limit::AtLeast(3.0));
-            ratios.push(Row { paper, limit, ..row });
+            ratios.push(TableRow { paper, limit, ..row });
         }
     }
     let table = |name, title: &str, y, rows| Table {

@@ -3,7 +3,7 @@
 use crossfix_simulation::Silhouette;
 
 use super::ValidationOptions;
-use super::table::{Limit, Row, Table};
+use super::table::{Limit, Table, TableRow};
 
 /// Sides, energy, and output signal-to-noise ratio in dB at sigma_n 0.1 to 0.6, as printed.
 const PRINTED: [([usize; 2], f64, [f64; 6]); 3] = [
@@ -22,7 +22,7 @@ pub(super) fn tables(_: ValidationOptions) -> Vec<Table> {
         let name = format!("{}x{}", sides[0], sides[1]);
         let near = |value: f64, share: f64| Limit::Near { value, tolerance: share * value };
         energies.push(
-            Row::new(&name, sides[0] as f64, (energy, 0.0))
+            TableRow::new(&name, sides[0] as f64, (energy, 0.0))
                 .paper(printed)
                 .limit(near(printed, 0.01)),
         );
@@ -30,8 +30,9 @@ pub(super) fn tables(_: ValidationOptions) -> Vec<Table> {
             let sigma_n = 0.1 * (i + 1) as f64;
             // h^2 = E / (2 sigma_n^2), Lytvynets 2020, chapter 6, eq. 3.
             let ratio = 10.0 * (energy / (2.0 * sigma_n * sigma_n)).log10();
-            ratios
-                .push(Row::new(&name, sigma_n, (ratio, 0.0)).paper(paper).limit(near(paper, 0.02)));
+            ratios.push(
+                TableRow::new(&name, sigma_n, (ratio, 0.0)).paper(paper).limit(near(paper, 0.02)),
+            );
         }
     }
     let table = |name, title: &str, x, y, rows| Table { name, title: title.to_owned(), x, y, rows };

@@ -120,7 +120,7 @@ impl Canvas {
 }
 
 /// A tracker started from the true places in the first two pictures.
-pub(crate) struct Follower {
+pub(crate) struct PaperFollower {
     tracker: ImageTracker,
     frame: usize,
     size: [f64; 2],
@@ -130,7 +130,7 @@ pub(crate) struct Follower {
 
 /// Errors of one picture's track, with the covariances that the filter stated.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Outcome {
+pub(crate) struct TrackErrors {
     /// Prediction less truth, px.
     pub(crate) prediction: [f64; 2],
     /// Variance of the prediction as the filter states it, per axis.
@@ -145,7 +145,7 @@ pub(crate) struct Outcome {
     pub(crate) nees: f64,
 }
 
-impl Follower {
+impl PaperFollower {
     /// A tracker with a configuration, for brightness from 0 to 1.
     pub(crate) fn new(config: TrackerConfig, sides: [usize; 2]) -> Option<Self> {
         let sigma_a = config.acceleration_sd_px;
@@ -167,7 +167,7 @@ impl Follower {
         truth: [f64; 2],
         velocity: [f64; 2],
         noise: &mut Noise,
-    ) -> Option<Outcome> {
+    ) -> Option<TrackErrors> {
         let [x, y] =
             if self.frame < 2 { truth.map(|at| at + GIVEN_SD * noise.normal()) } else { truth };
         let place = ImagePoint { x, y };
@@ -192,7 +192,7 @@ impl Follower {
         now: &ImageTrack,
         truth: [f64; 2],
         velocity: [f64; 2],
-    ) -> Option<Outcome> {
+    ) -> Option<TrackErrors> {
         let of = |p: ImagePoint| [p.x, p.y];
         let (was, speed, is, is_speed) =
             (of(before.position), of(before.velocity), of(now.position), of(now.velocity));
@@ -212,7 +212,7 @@ impl Follower {
             })
             .sum::<f64>()
             / 2.0;
-        Some(Outcome {
+        Some(TrackErrors {
             prediction: [0, 1].map(|i| predicted[i] - truth[i]),
             prediction_variance: spread,
             estimate: [0, 1].map(|i| is[i] - truth[i]),

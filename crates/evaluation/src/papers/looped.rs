@@ -5,9 +5,9 @@ use crossfix_simulation::Silhouette;
 use crossfix_vision::{ImmConfig, ReferenceStrategy, TrackerConfig};
 
 use super::ValidationOptions;
-use super::flight::{Canvas, Follower, Stamp};
+use super::flight::{Canvas, PaperFollower, Stamp};
 use super::runs::{self, Noise};
-use super::table::{Limit, Row, Table, mean, root_mean_square, share};
+use super::table::{Limit, Table, TableRow, mean, root_mean_square, share};
 
 const SIDES: [usize; 2] = [25, 15];
 const SIGMA_N: f64 = 0.25;
@@ -17,7 +17,7 @@ const RUNS_SHARE: usize = 4;
 
 /// What happens to the target in a flight.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Scene {
+struct LoopCase {
     name: &'static str,
     light: bool,
     occlusion: bool,
@@ -27,12 +27,12 @@ struct Scene {
     asked: f64,
 }
 
-const SCENES: [Scene; 5] = [
-    Scene { name: "no change", light: false, occlusion: false, turn: false, asked: 0.22 },
-    Scene { name: "light steps", light: true, occlusion: false, turn: false, asked: 0.24 },
-    Scene { name: "occlusion", light: false, occlusion: true, turn: false, asked: 0.26 },
-    Scene { name: "rotation", light: false, occlusion: false, turn: true, asked: 0.44 },
-    Scene { name: "all together", light: true, occlusion: true, turn: true, asked: 0.9 },
+const SCENES: [LoopCase; 5] = [
+    LoopCase { name: "no change", light: false, occlusion: false, turn: false, asked: 0.22 },
+    LoopCase { name: "light steps", light: true, occlusion: false, turn: false, asked: 0.24 },
+    LoopCase { name: "occlusion", light: false, occlusion: true, turn: false, asked: 0.26 },
+    LoopCase { name: "rotation", light: false, occlusion: false, turn: true, asked: 0.44 },
+    LoopCase { name: "all together", light: true, occlusion: true, turn: true, asked: 0.9 },
 ];
 
 /// The target's place at a frame: a Lissajous figure within the picture, with accelerations below
@@ -46,14 +46,14 @@ fn place(frame: usize, phases: [f64; 2]) -> [f64; 2] {
 fn fly(
     options: ValidationOptions,
     run: usize,
-    scene: Scene,
+    scene: LoopCase,
     stamps: &[Stamp],
     config: &TrackerConfig,
 ) -> Option<(f64, bool)> {
     let mut noise = Noise::new(options.seed, run);
     let phases = [noise.uniform(), noise.uniform()].map(|u| u * std::f64::consts::TAU);
     let mut canvas = Canvas::new(SIDES);
-    let mut follower = Follower::new(config.clone(), SIDES)?;
+    let mut follower = PaperFollower::new(config.clone(), SIDES)?;
     let (mut strength, mut level) = (1.0_f32, 0.0_f32);
     let (mut errors, mut off_at_end) = (Vec::new(), false);
     for frame in 0..FRAMES {
@@ -116,10 +116,10 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             let x = number as f64;
             let paper = index.checked_sub(1).map(|i| errata[i][number]);
             let asked = |limit| (index == 0).then_some(limit);
-            let row = Row::new(&series, x, mean(&kept));
-            accuracy.push(Row { paper, limit: asked(Limit::AtMost(scene.asked)), ..row });
-            let row = Row::new(&series, x, share(runs.iter().map(|(_, lost)| *lost)));
-            losses.push(Row { limit: asked(Limit::AtMost(0.0)), ..row });
+            let row = TableRow::new(&series, x, mean(&kept));
+            accuracy.push(TableRow { paper, limit: asked(Limit::AtMost(scene.asked)), ..row });
+            let row = TableRow::new(&series, x, share(runs.iter().map(|(_, lost)| *lost)));
+            losses.push(TableRow { limit: asked(Limit::AtMost(0.0)), ..row });
         }
     }
     let table =

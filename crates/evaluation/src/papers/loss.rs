@@ -5,9 +5,9 @@ use crossfix_simulation::Silhouette;
 use crossfix_vision::TrackerConfig;
 
 use super::ValidationOptions;
-use super::flight::{Canvas, FRAMES, Follower, Stamp, texts_path};
+use super::flight::{Canvas, FRAMES, PaperFollower, Stamp, texts_path};
 use super::runs::{self, Noise};
-use super::table::{Limit, Row, Table, mean, share};
+use super::table::{Limit, Table, TableRow, mean, share};
 
 const SIGMAS: [f64; 6] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
 
@@ -54,7 +54,7 @@ fn kept(
         let mut noise = Noise::new(options.seed, run);
         let path = texts_path(&mut noise, FRAMES, 1.0);
         let mut canvas = Canvas::new(sides);
-        let Some(mut follower) = Follower::new(config.clone(), sides) else { return 0 };
+        let Some(mut follower) = PaperFollower::new(config.clone(), sides) else { return 0 };
         for (frame, place) in path.iter().enumerate() {
             let image = canvas.paint(Some(stamp), *place, (1.0, 0.0), sigma_n, &mut noise);
             let off = follower
@@ -96,12 +96,12 @@ pub(super) fn paper_tables(options: ValidationOptions) -> Vec<Table> {
         let name = format!("{}x{}", sides[0], sides[1]);
         for (i, sigma_n) in SIGMAS.into_iter().enumerate() {
             let runs = kept(options, &stamp, *sides, sigma_n, &TrackerConfig::paper());
-            let row = Row::new(&name, sigma_n, lost(&runs)).paper(paper_lost[i]);
-            lost_rows.push(Row { limit: expected_lost(*sides, sigma_n), ..row });
-            let row = Row::new(&name, sigma_n, frames(&runs)).paper(paper_frames[i]);
+            let row = TableRow::new(&name, sigma_n, lost(&runs)).paper(paper_lost[i]);
+            lost_rows.push(TableRow { limit: expected_lost(*sides, sigma_n), ..row });
+            let row = TableRow::new(&name, sigma_n, frames(&runs)).paper(paper_frames[i]);
             let asked =
                 (sides[0] == 10 && i == 3).then_some(Limit::Near { value: 7.4, tolerance: 0.7 });
-            kept_rows.push(Row { limit: asked, ..row });
+            kept_rows.push(TableRow { limit: asked, ..row });
         }
     }
     let table =
@@ -134,8 +134,8 @@ pub(super) fn default_tables(options: ValidationOptions) -> Vec<Table> {
             let asked = ASKED
                 .iter()
                 .find(|(w, s, _)| *w == sides[0] && *s == (sigma_n * 10.0).round() as u32);
-            let row = Row::new(&name, sigma_n, lost(&runs));
-            rows.push(Row {
+            let row = TableRow::new(&name, sigma_n, lost(&runs));
+            rows.push(TableRow {
                 paper: paper.get(i).copied(),
                 limit: asked.map(|(_, _, most)| Limit::AtMost(*most)),
                 ..row

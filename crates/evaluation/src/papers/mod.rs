@@ -13,7 +13,7 @@ mod positioning;
 mod runs;
 mod table;
 
-pub use table::{Limit, Row, Table, Verdict};
+pub use table::{Limit, Table, TableRow, Verdict};
 
 /// Extent of the simulation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

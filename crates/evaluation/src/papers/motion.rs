@@ -6,9 +6,9 @@ use crossfix_vision::TrackerConfig;
 use nalgebra::Vector2;
 
 use super::ValidationOptions;
-use super::flight::{Canvas, FRAMES, Follower, Outcome, Stamp, TACT, texts_path};
+use super::flight::{Canvas, FRAMES, PaperFollower, Stamp, TACT, TrackErrors, texts_path};
 use super::runs::{self, Noise};
-use super::table::{Limit, Row, Table, mean, root_mean_square};
+use super::table::{Limit, Table, TableRow, mean, root_mean_square};
 
 /// Number of runs of the filter alone for each run of the tracker: they take next to no time.
 const CHEAP: usize = 20;
@@ -44,7 +44,7 @@ fn filter_nees(options: ValidationOptions, sigma_a: f64) -> (f64, f64) {
 /// Motion of a target: white acceleration with an SD, px/tact^2, for a number of frames, the first
 /// `skipped` outcomes of which do not count.
 #[derive(Clone, Copy)]
-struct Flight {
+struct MotionCase {
     name: &'static str,
     sigma_a: f64,
     frames: usize,
@@ -53,23 +53,23 @@ struct Flight {
 
 /// The papers' flight, and a straight one, counted from when a second has shown that it is
 /// straight.
-const TEXTS: Flight = Flight { name: "texts", sigma_a: 1.0, frames: FRAMES, skipped: 0 };
-const STRAIGHT: Flight = Flight { name: "straight", sigma_a: 0.0, frames: 50, skipped: 30 };
+const TEXTS: MotionCase = MotionCase { name: "texts", sigma_a: 1.0, frames: FRAMES, skipped: 0 };
+const STRAIGHT: MotionCase = MotionCase { name: "straight", sigma_a: 0.0, frames: 50, skipped: 30 };
 
 /// The outcomes of every frame, of runs in which the tracker kept the target.
 fn outcomes(
     options: ValidationOptions,
-    flight: Flight,
+    flight: MotionCase,
     sides: [usize; 2],
     sigma_n: f64,
     config: &TrackerConfig,
-) -> Vec<Vec<Outcome>> {
+) -> Vec<Vec<TrackErrors>> {
     let stamp = Stamp::Drawn(Silhouette::new(sides[0], sides[1]));
     let runs = runs::all(options.runs, |run| {
         let mut noise = Noise::new(options.seed, run);
         let path = texts_path(&mut noise, flight.frames, flight.sigma_a);
         let mut canvas = Canvas::new(sides);
-        let mut follower = Follower::new(config.clone(), sides)?;
+        let mut follower = PaperFollower::new(config.clone(), sides)?;
         let mut outcomes = Vec::new();
         for (frame, place) in path.iter().enumerate() {
             let image = canvas.paint(Some(&stamp), *place, (1.0, 0.0), sigma_n, &mut noise);
@@ -81,7 +81,7 @@ fn outcomes(
         outcomes.drain(..flight.skipped.min(outcomes.len()));
         Some(outcomes)
     });
-    let kept = |run: &Vec<Outcome>| {
+    let kept = |run: &Vec<TrackErrors>| {
         run.iter().all(|o| {
             o.prediction[0].abs() <= sides[0] as f64 && o.prediction[1].abs() <= sides[1] as f64
         })
@@ -102,7 +102,7 @@ fn velocity_at(path: &[[f64; 2]], frame: usize) -> [f64; 2] {
 
 /// The mean over all frames and runs, with its error from the runs' means: the runs are
 /// independent, the frames of a run are not.
-fn over_runs(runs: &[Vec<Outcome>], of: impl Fn(&Outcome) -> Option<f64>) -> (f64, f64) {
+fn over_runs(runs: &[Vec<TrackErrors>], of: impl Fn(&TrackErrors) -> Option<f64>) -> (f64, f64) {
     let each: Vec<f64> =
         runs.iter().map(|run| mean(&run.iter().filter_map(&of).collect::<Vec<_>>()).0).collect();
     mean(&each)
@@ -112,7 +112,7 @@ fn over_runs(runs: &[Vec<Outcome>], of: impl Fn(&Outcome) -> Option<f64>) -> (f6
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let near_two = |tolerance| Limit::Near { value: 2.0, tolerance };
     let nees = [0.3, 1.0, 3.0].map(|sigma_a| {
-        Row::new("filter alone", sigma_a, filter_nees(options, sigma_a)).limit(near_two(0.1))
+        TableRow::new("filter alone", sigma_a, filter_nees(options, sigma_a)).limit(near_two(0.1))
     });
     let table = |name, title: &str, x, y, rows| Table { name, title: title.to_owned(), x, y, rows };
     vec![
@@ -138,7 +138,7 @@ fn honesty(options: ValidationOptions) -> Table {
                 ] {
                     let name = format!("{what} {}x{}, {}", sides[0], sides[1], flight.name);
                     let limit = Limit::Near { value: 2.0, tolerance: 0.1 };
-                    rows.push(Row::new(name, sigma_n, figure).limit(limit));
+                    rows.push(TableRow::new(name, sigma_n, figure).limit(limit));
                 }
             }
         }
@@ -152,22 +152,24 @@ fn figure_6(options: ValidationOptions) -> Table {
     let runs = outcomes(options, TEXTS, [10, 6], 0.1, &TrackerConfig::paper());
     let mut rows = Vec::new();
     for frame in 0..FRAMES - 2 {
-        let at = |of: &dyn Fn(&Outcome) -> f64| -> Vec<f64> {
+        let at = |of: &dyn Fn(&TrackErrors) -> f64| -> Vec<f64> {
             runs.iter().filter_map(|run| run.get(frame)).map(of).collect()
         };
         let x = (frame + 2) as f64;
-        rows.push(Row::new(
+        rows.push(TableRow::new(
             "prediction, Monte Carlo",
             x,
             root_mean_square(&at(&|o| o.prediction[0])),
         ));
         let filters = mean(&at(&|o| o.prediction_variance[0].sqrt()));
-        rows.push(Row::new("prediction, filter", x, filters));
+        rows.push(TableRow::new("prediction, filter", x, filters));
         // "The actual SD does not exceed the theoretical SD": holds at sigma_n 0.1 (errata).
         let actual = root_mean_square(&at(&|o| o.estimate[0]));
         let theoretical = mean(&at(&|o| o.estimate_variance[0].sqrt()));
-        rows.push(Row::new("estimate, Monte Carlo", x, actual).limit(Limit::AtMost(theoretical.0)));
-        rows.push(Row::new("estimate, filter", x, theoretical));
+        rows.push(
+            TableRow::new("estimate, Monte Carlo", x, actual).limit(Limit::AtMost(theoretical.0)),
+        );
+        rows.push(TableRow::new("estimate, filter", x, theoretical));
     }
     let title =
         "Errors of prediction and estimate on x, 10x6, sigma_n 0.1 (Herasymenko 2021, Fig. 6)"

@@ -5,7 +5,7 @@ use crossfix_simulation::{Silhouette, TEMPLATE_SIZES};
 
 use super::ValidationOptions;
 use super::runs::{self, Noise};
-use super::table::{Limit, Row, Table, root_mean_square};
+use super::table::{Limit, Table, TableRow, root_mean_square};
 
 /// Margin of the reference, px.
 const MARGIN: usize = 3;
@@ -132,7 +132,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                     // Herasymenko 2021, eq. 16: 2 sigma over the side. The paper claims it to be
                     // below a pixel.
                     let normalised = 2.0 / size[axis] as f64;
-                    accuracy.push(Row::new(
+                    accuracy.push(TableRow::new(
                         &series,
                         sigma_n,
                         (deviation * normalised, standard_error * normalised),
@@ -143,7 +143,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                         bound[axis] * sigma_n * if noisy { std::f64::consts::SQRT_2 } else { 1.0 };
                     let asked = Limit::AtMost(if noisy { 1.35 } else { 1.10 });
                     ratios.push(
-                        Row::new(series, sigma_n, (deviation / best, standard_error / best))
+                        TableRow::new(series, sigma_n, (deviation / best, standard_error / best))
                             .limit(asked),
                     );
                 }
@@ -153,11 +153,12 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             let label = ["x", "y"][axis];
             let near = Limit::Near { value: errata[axis], tolerance: 0.02 * errata[axis] };
             ratios.push(
-                Row::new(format!("bound {name} {label}"), 1.0, (bound[axis], 0.0)).limit(near),
+                TableRow::new(format!("bound {name} {label}"), 1.0, (bound[axis], 0.0)).limit(near),
             );
             let worst = worst_bias(&silhouette, axis);
             bias.push(
-                Row::new(format!("{name} {label}"), 0.0, (worst, 0.0)).limit(Limit::AtMost(0.01)),
+                TableRow::new(format!("{name} {label}"), 0.0, (worst, 0.0))
+                    .limit(Limit::AtMost(0.01)),
             );
         }
     }

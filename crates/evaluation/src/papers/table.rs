@@ -33,7 +33,7 @@ pub enum Verdict {
 
 /// A figure beside the paper's.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Row {
+pub struct TableRow {
     /// Name of the curve.
     pub series: String,
     /// Abscissa on the curve.
@@ -50,7 +50,7 @@ pub struct Row {
     pub standard_error: f64,
 }
 
-impl Row {
+impl TableRow {
     /// A row with our figure alone.
     pub fn new(series: impl Into<String>, x: f64, (ours, standard_error): (f64, f64)) -> Self {
         Self {
@@ -112,7 +112,7 @@ pub struct Table {
     /// What the figures are.
     pub y: &'static str,
     /// Its rows.
-    pub rows: Vec<Row>,
+    pub rows: Vec<TableRow>,
 }
 
 impl Table {
@@ -170,7 +170,7 @@ mod tests {
 
     #[test]
     fn verdicts_follow_the_limits() {
-        let row = |ours, limit| Row::new("", 0.0, (ours, 0.01)).limit(limit).verdict();
+        let row = |ours, limit| TableRow::new("", 0.0, (ours, 0.01)).limit(limit).verdict();
         assert_eq!(row(0.5, Limit::AtMost(0.5)), Verdict::Pass);
         assert_eq!(row(0.6, Limit::AtMost(0.5)), Verdict::Fail);
         assert_eq!(row(0.4, Limit::AtLeast(0.5)), Verdict::Fail);
@@ -178,7 +178,7 @@ mod tests {
         assert_eq!(row(1.029, near(0.001)), Verdict::Pass);
         assert_eq!(row(1.031, near(0.001)), Verdict::Fail);
         assert_eq!(row(1.031, near(0.05)), Verdict::Pass);
-        assert_eq!(Row::new("", 0.0, (1.0, 0.0)).verdict(), Verdict::Information);
+        assert_eq!(TableRow::new("", 0.0, (1.0, 0.0)).verdict(), Verdict::Information);
     }
 
     #[test]

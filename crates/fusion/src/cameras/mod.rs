@@ -35,15 +35,15 @@ use calibration::Calibrations;
 use clutter::ClutterRate;
 use noise::WhiteNoise;
 use pose_scale::PoseScale;
-use rooted::View;
+use rooted::RootedView;
 use standing::Standing;
-use watch::Watch;
+use watch::ErrorWatch;
 
 pub(crate) use calibration::KnownCamera;
 pub(crate) use clutter::view_sr;
 pub(crate) use noise::LastThree;
 pub(crate) use pointing::Pointed;
-pub(crate) use pose_scale::Sample;
+pub(crate) use pose_scale::ScaleSample;
 pub(crate) use rooted::Rooted;
 pub use standing::CameraStanding;
 pub(crate) use standing::{Fitting, Fittings};
@@ -87,7 +87,7 @@ pub(crate) struct CameraState {
     pose_scale: PoseScale,
     noise: WhiteNoise,
     clutter: ClutterRate,
-    view: View,
+    view: RootedView,
     told_clock: Option<ToldClock>,
     /// By the targets that three others see.
     standing: Standing,
@@ -105,7 +105,7 @@ impl CameraState {
             pointed: None,
             noise: WhiteNoise::default(),
             clutter: ClutterRate::default(),
-            view: View::new(rooted_s),
+            view: RootedView::new(rooted_s),
             told_clock: None,
             standing: Standing::default(),
             misfits: Standing::default(),
@@ -241,13 +241,13 @@ pub(crate) struct Cameras {
     by_name: BTreeMap<CameraName, CameraState>,
     /// What stays in one place for this long is rooted, s.
     rooted_s: f64,
-    watch: Watch,
+    watch: ErrorWatch,
 }
 
 impl Cameras {
     /// No camera is known yet. What stays in one place for `rooted_s` is rooted.
     pub(crate) fn new(rooted_s: f64) -> Self {
-        Self { by_name: BTreeMap::new(), rooted_s, watch: Watch::default() }
+        Self { by_name: BTreeMap::new(), rooted_s, watch: ErrorWatch::default() }
     }
 
     /// Adds a camera, or a calibration of it that holds from a capture time on. The first

@@ -48,7 +48,7 @@ const NOTICED: f64 = 0.1;
 
 /// What a camera has seen of a target during one draw.
 #[derive(Clone, Debug)]
-pub(crate) struct Sample {
+pub(crate) struct ScaleSample {
     pub(crate) camera: CameraName,
     /// Mean offset of its bearings from the track, rad.
     pub(crate) offset: Vector2<f64>,
@@ -144,7 +144,7 @@ impl PoseScale {
 impl Cameras {
     /// Takes in what cameras have seen of a target; returns those whose pose's factor has changed,
     /// each with the ratio.
-    pub(crate) fn learn_poses(&mut self, samples: &[Sample]) -> Vec<(CameraName, f64)> {
+    pub(crate) fn learn_poses(&mut self, samples: &[ScaleSample]) -> Vec<(CameraName, f64)> {
         let Some(found) = self.found_and_expected(samples) else {
             return Vec::new();
         };
@@ -158,8 +158,9 @@ impl Cameras {
     }
 
     /// Median of the cameras' factors, in their logarithms.
-    fn typical_scale(&self, samples: &[Sample]) -> f64 {
-        let logarithm = |sample: &Sample| Some(self.get(&sample.camera)?.pose_scale.value.ln());
+    fn typical_scale(&self, samples: &[ScaleSample]) -> f64 {
+        let logarithm =
+            |sample: &ScaleSample| Some(self.get(&sample.camera)?.pose_scale.value.ln());
         let mut logarithms: Vec<f64> = samples.iter().filter_map(logarithm).collect();
         logarithms.sort_unstable_by(f64::total_cmp);
         let middle = |k: usize| logarithms.get(k).copied().unwrap_or(0.0);
@@ -169,11 +170,12 @@ impl Cameras {
 
     /// For each camera, by its factor: the squared pose error that explains its part of a draw, and
     /// the expectation of it.
-    fn found_and_expected(&self, samples: &[Sample]) -> Option<Vec<(f64, f64)>> {
-        let scale = |sample: &Sample| {
+    fn found_and_expected(&self, samples: &[ScaleSample]) -> Option<Vec<(f64, f64)>> {
+        let scale = |sample: &ScaleSample| {
             self.get(&sample.camera).map_or(1.0, |camera| camera.pose_scale.value)
         };
-        let weight = |s: &Sample| (s.noise + s.pose * s.pose.transpose() * scale(s)).try_inverse();
+        let weight =
+            |s: &ScaleSample| (s.noise + s.pose * s.pose.transpose() * scale(s)).try_inverse();
         let weights: Vec<Matrix2<f64>> = samples.iter().map(weight).collect::<Option<_>>()?;
         let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
         for (sample, weight) in samples.iter().zip(&weights) {
@@ -185,8 +187,8 @@ impl Cameras {
         // which takes from a residual what the place has explained: REML.
         let spread = information.try_inverse()?;
         let place = spread * pull;
-        let of_camera = |(sample, weight): (&Sample, &Matrix2<f64>)| {
-            let Sample { offset, by_position, pose, .. } = sample;
+        let of_camera = |(sample, weight): (&ScaleSample, &Matrix2<f64>)| {
+            let ScaleSample { offset, by_position, pose, .. } = sample;
             // With pose root L and factor s: found s |L' W (z - A x)|^2, expected s tr(L' P L).
             let error = pose.transpose() * weight * (offset - by_position * place);
             let told = weight - weight * by_position * spread * by_position.transpose() * weight;

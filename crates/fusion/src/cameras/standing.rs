@@ -67,7 +67,7 @@ impl Fittings {
 
 /// Evidence for a verdict on a camera.
 #[derive(Clone, Copy, Debug)]
-struct Evidence {
+struct StandingEvidence {
     /// Share of the time in which the camera has been wrong.
     wrong: f64,
     /// How long the camera has been compared, s.
@@ -76,7 +76,7 @@ struct Evidence {
     excluded: bool,
 }
 
-impl Evidence {
+impl StandingEvidence {
     fn beginning(time: Timestamp) -> Self {
         Self { wrong: 0.0, compared_s: 0.0, last: time, excluded: false }
     }
@@ -85,7 +85,7 @@ impl Evidence {
 /// Standing of a camera by one kind of evidence; `None` as long as there was nothing to compare it
 /// with.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Standing(Option<Evidence>);
+pub(super) struct Standing(Option<StandingEvidence>);
 
 impl Standing {
     /// Takes in how an exposure fits, at a time by its camera's own clock. All targets of one
@@ -94,7 +94,7 @@ impl Standing {
         if fittings.is_empty() {
             return;
         }
-        let evidence = self.0.get_or_insert(Evidence::beginning(time));
+        let evidence = self.0.get_or_insert(StandingEvidence::beginning(time));
         let step_s = time.seconds_since(evidence.last).abs().min(LONGEST_STEP_S);
         evidence.last = time;
         evidence.compared_s = (evidence.compared_s + step_s).min(MEMORY_S);
@@ -117,10 +117,11 @@ impl Standing {
     /// long, as there is no target left to compare it with, an exclusion lapses: returns whether it
     /// has.
     pub(super) fn lapse(&mut self, time: Timestamp) -> bool {
-        let is_old = |evidence: &&mut Evidence| time.seconds_since(evidence.last).abs() > MEMORY_S;
+        let is_old =
+            |evidence: &&mut StandingEvidence| time.seconds_since(evidence.last).abs() > MEMORY_S;
         let lapsed = self.0.as_mut().filter(|evidence| evidence.excluded).filter(is_old);
         lapsed.is_some_and(|evidence| {
-            *evidence = Evidence::beginning(time);
+            *evidence = StandingEvidence::beginning(time);
             true
         })
     }

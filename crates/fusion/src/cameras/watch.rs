@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Matrix6, SMatrix, SVector, Vector3};
 
-use super::{Cameras, Sample};
+use super::{Cameras, ScaleSample};
 
 /// Time constants of the memories, s in which targets are seen: a camera was moved that long ago,
 /// or longer, each as likely. A large turn shows in the shorter time, while most of the longer one
@@ -80,7 +80,7 @@ impl PoseFinding {
 
 /// What the lines say about the errors of all cameras.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Watch {
+pub(super) struct ErrorWatch {
     cameras: Vec<Watched>,
     memories: [Memory; MEMORIES_S.len()],
     drawn: Option<Timestamp>,
@@ -171,7 +171,7 @@ impl Watched {
     }
 
     /// Derivative of a line by the errors.
-    fn by_errors(&self, sample: &Sample) -> SMatrix<f64, 2, ERRORS> {
+    fn by_errors(&self, sample: &ScaleSample) -> SMatrix<f64, 2, ERRORS> {
         let mut by = SMatrix::<f64, 2, ERRORS>::zeros();
         by.fixed_columns_mut::<6>(0).copy_from(&(sample.by_pose * self.root));
         by.set_column(CLOCK, &sample.clock);
@@ -248,7 +248,7 @@ impl Watched {
     }
 }
 
-impl Watch {
+impl ErrorWatch {
     fn place_of(&mut self, name: &CameraName, declared: &Matrix6<f64>) -> usize {
         if let Some(place) = self.known(name) {
             return place;
@@ -297,7 +297,7 @@ impl Watch {
 
     /// Takes in what cameras have seen of one target; `places` are their indices among those
     /// watched.
-    fn learn(&mut self, samples: &[Sample], places: &[usize], now: Timestamp) -> Option<()> {
+    fn learn(&mut self, samples: &[ScaleSample], places: &[usize], now: Timestamp) -> Option<()> {
         let by_errors: Vec<_> = samples
             .iter()
             .zip(places)
@@ -379,7 +379,7 @@ struct Meeting {
 
 impl Meeting {
     /// Weighted least squares, with the inverse covariance of each line.
-    fn of(samples: &[Sample], weights: &[Matrix2<f64>]) -> Option<Self> {
+    fn of(samples: &[ScaleSample], weights: &[Matrix2<f64>]) -> Option<Self> {
         let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
         for (sample, weight) in samples.iter().zip(weights) {
             let weighed = sample.by_position.transpose() * weight;
@@ -388,7 +388,7 @@ impl Meeting {
         }
         let spread = information.try_inverse()?;
         let place = spread * pull;
-        let missed = |(sample, weight): (&Sample, &Matrix2<f64>)| {
+        let missed = |(sample, weight): (&ScaleSample, &Matrix2<f64>)| {
             let missed = sample.offset - sample.by_position * place;
             missed.dot(&(weight * missed))
         };
@@ -399,7 +399,7 @@ impl Meeting {
 
 impl Cameras {
     /// Takes in what cameras have seen of one target at a time.
-    pub(crate) fn watch(&mut self, samples: &[Sample], now: Timestamp) {
+    pub(crate) fn watch(&mut self, samples: &[ScaleSample], now: Timestamp) {
         let Self { by_name, watch, .. } = self;
         watch.age(now);
         let mut places = Vec::with_capacity(samples.len());
@@ -424,10 +424,10 @@ mod tests {
     use super::*;
 
     /// What two cameras see of a target at a place, where the first one is turned.
-    fn samples(turn: Vector3<f64>, place: Point3<f64>) -> Vec<Sample> {
+    fn samples(turn: Vector3<f64>, place: Point3<f64>) -> Vec<ScaleSample> {
         let sample = |name: &str, origin: Point3<f64>, turn: Vector3<f64>| {
             let model = BearingModel::new(origin, place).unwrap();
-            Sample {
+            ScaleSample {
                 camera: name.parse().unwrap(),
                 offset: model.by_pose().fixed_columns::<3>(0) * turn,
                 by_position: model.by_position(),
@@ -446,9 +446,9 @@ mod tests {
 
     /// A minute of a target that moves by `moves_m`, m, seen by two cameras of which one is turned,
     /// rad.
-    fn watched(turn: Vector3<f64>, moves_m: f64) -> Watch {
+    fn watched(turn: Vector3<f64>, moves_m: f64) -> ErrorWatch {
         let declared = Matrix6::from_diagonal_element(9e-8);
-        let mut watch = Watch::default();
+        let mut watch = ErrorWatch::default();
         for k in 0..200u32 {
             let t = f64::from(k) * 0.3;
             watch.age(Timestamp::from_seconds(t));

@@ -4,7 +4,7 @@
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 use super::curve::{Basis, Curve};
-use super::window::Sight;
+use super::window::WindowBearing;
 
 /// Squared Mahalanobis distance (two degrees of freedom) beyond which a bearing pulls no harder, in
 /// the first descent, when all may be far off.
@@ -58,7 +58,7 @@ pub(super) struct Unknowns {
 
 /// Prior of the cameras' clocks and poses.
 #[derive(Clone, Debug)]
-pub(super) struct Prior {
+pub(super) struct ClockPrior {
     pub(super) mean: DVector<f64>,
     pub(super) precision: DMatrix<f64>,
     /// Time at which the prior's offsets hold, s after the window's beginning.
@@ -68,7 +68,7 @@ pub(super) struct Prior {
 
 /// State that is fitted: coefficients of the target's trajectory, clocks and poses of the cameras.
 #[derive(Clone, Debug)]
-struct State {
+struct WindowState {
     coefficients: DVector<f64>,
     cameras: DVector<f64>,
 }
@@ -76,7 +76,7 @@ struct State {
 /// A bearing's target at a state, as a camera with the stated pose would see it: its place, and the
 /// shift of that place by each component of the cameras' errors.
 #[derive(Clone, Debug)]
-struct Target {
+struct PredictedTarget {
     basis: Basis,
     place: Vector3<f64>,
     shifts: [(usize, Vector3<f64>); 8],
@@ -95,7 +95,7 @@ struct Quadratic {
 
 /// Result of an adjustment.
 #[derive(Clone, Debug)]
-pub(super) struct Adjusted {
+pub(super) struct AdjustedClocks {
     pub(super) cameras: DVector<f64>,
     pub(super) covariance: DMatrix<f64>,
     /// Factor on each camera's reported covariances: 1 where these agree with its residuals.
@@ -112,20 +112,20 @@ pub(super) struct Adjusted {
 /// One window's bearings, with the prior of its cameras.
 #[derive(Clone, Debug)]
 pub(super) struct Adjustment<'a> {
-    sights: &'a [Sight],
+    sights: &'a [WindowBearing],
     curve: Curve,
-    prior: &'a Prior,
+    prior: &'a ClockPrior,
     /// Factor on each camera's covariances.
     scales: Vec<f64>,
 }
 
 impl<'a> Adjustment<'a> {
-    pub(super) fn new(sights: &'a [Sight], curve: Curve, prior: &'a Prior) -> Self {
+    pub(super) fn new(sights: &'a [WindowBearing], curve: Curve, prior: &'a ClockPrior) -> Self {
         Self { sights, curve, prior, scales: vec![1.0; prior.cameras.len()] }
     }
 
     /// Fits trajectory, clocks and poses. `None` if the numbers fail.
-    pub(super) fn solve(mut self, density: i32) -> Option<Adjusted> {
+    pub(super) fn solve(mut self, density: i32) -> Option<AdjustedClocks> {
         let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
         self.rescale(&state, Loss::Huber);
         let (mut state, mut density, mut evidence) = self.best_density(state, density)?;
@@ -135,7 +135,7 @@ impl<'a> Adjustment<'a> {
         let outlier_shares =
             self.squares(&state).iter().map(|squares| outlier_share(squares)).collect();
         let (covariance, pulled) = self.posterior(&state, density)?;
-        Some(Adjusted {
+        Some(AdjustedClocks {
             cameras: state.cameras,
             covariance,
             scales: self.scales,
@@ -148,7 +148,7 @@ impl<'a> Adjustment<'a> {
     /// Sets each camera's covariance factor from its residuals: after the first descent, when not
     /// all may fit, from their median; in the end from the mean of those that fit. Returns whether
     /// a factor has changed much.
-    fn rescale(&mut self, state: &State, loss: Loss) -> bool {
+    fn rescale(&mut self, state: &WindowState, loss: Loss) -> bool {
         let squares = self.squares(state);
         let mut changed = false;
         for (scale, mut squares) in self.scales.iter_mut().zip(squares) {
@@ -173,10 +173,14 @@ impl<'a> Adjustment<'a> {
     }
 
     /// Squared Mahalanobis distances of each camera's bearings.
-    fn squares(&self, state: &State) -> Vec<Vec<f64>> {
+    fn squares(&self, state: &WindowState) -> Vec<Vec<f64>> {
         let mut squares = vec![Vec::new(); self.scales.len()];
         for sight in self.sights {
-            let seen = Seen::at(sight, self.target(sight, state).place, self.scales[sight.camera]);
+            let seen = BearingResidual::at(
+                sight,
+                self.target(sight, state).place,
+                self.scales[sight.camera],
+            );
             squares[sight.camera].push(seen.map_or(f64::INFINITY, |seen| seen.squared));
         }
         squares
@@ -184,14 +188,14 @@ impl<'a> Adjustment<'a> {
 
     /// Start of the descent: clocks and poses of the prior, a trajectory through the track's
     /// places.
-    fn begin(&self) -> Option<State> {
+    fn begin(&self) -> Option<WindowState> {
         let cameras = self.prior.mean.clone();
         let places = self.sights.iter().map(|sight| (self.time(sight, &cameras).0, sight.place));
-        Some(State { coefficients: self.curve.fit(places, 1.0)?, cameras })
+        Some(WindowState { coefficients: self.curve.fit(places, 1.0)?, cameras })
     }
 
     /// Time of a bearing by the reference's clock, s, and its time after the prior's epoch, s.
-    fn time(&self, sight: &Sight, cameras: &DVector<f64>) -> (f64, f64) {
+    fn time(&self, sight: &WindowBearing, cameras: &DVector<f64>) -> (f64, f64) {
         let since = sight.time_s - self.prior.epoch_s;
         let clock = self.prior.cameras[sight.camera].clock;
         let offset = clock.map_or(0.0, |place| cameras[place] + cameras[place + 1] * since);
@@ -202,7 +206,7 @@ impl<'a> Adjustment<'a> {
     /// offset moves the place by minus the velocity, the drift by that times the time since the
     /// epoch. A camera whose stated pose is turned by d and moved by c
     /// against its true one has the target at p + d x (p - origin) + c.
-    fn target(&self, sight: &Sight, state: &State) -> Target {
+    fn target(&self, sight: &WindowBearing, state: &WindowState) -> PredictedTarget {
         let (time_s, since) = self.time(sight, &state.cameras);
         let basis = self.curve.basis(time_s);
         let (mut place, velocity) = basis.at(&state.coefficients);
@@ -228,12 +232,12 @@ impl<'a> Adjustment<'a> {
                     turned * state.cameras[first + axis] + unit * state.cameras[first + 3 + axis];
             }
         }
-        Target { basis, place, shifts, count }
+        PredictedTarget { basis, place, shifts, count }
     }
 
     /// Climbs to the jerk density of the greatest evidence; returns its state, density and
     /// evidence.
-    fn best_density(&self, state: State, first: i32) -> Option<(State, i32, f64)> {
+    fn best_density(&self, state: WindowState, first: i32) -> Option<(WindowState, i32, f64)> {
         let (state, evidence) = self.with_evidence(state, first)?;
         let mut best = (state, first, evidence);
         for step in [-1, 1] {
@@ -257,7 +261,7 @@ impl<'a> Adjustment<'a> {
     }
 
     /// Descends; returns the state and twice the log evidence (Laplace's), up to a constant.
-    fn with_evidence(&self, state: State, density: i32) -> Option<(State, f64)> {
+    fn with_evidence(&self, state: WindowState, density: i32) -> Option<(WindowState, f64)> {
         let (state, Quadratic { cost, information, .. }) =
             self.descend(state, density, Loss::Trimmed)?;
         // ln det A = 2 sum ln L_ii for A = L L'.
@@ -275,7 +279,12 @@ impl<'a> Adjustment<'a> {
     }
 
     /// Levenberg-Marquardt descent to the most likely state.
-    fn descend(&self, mut state: State, density: i32, loss: Loss) -> Option<(State, Quadratic)> {
+    fn descend(
+        &self,
+        mut state: WindowState,
+        density: i32,
+        loss: Loss,
+    ) -> Option<(WindowState, Quadratic)> {
         let mut here = self.quadratic(&state, density, loss);
         let mut damping = FIRST_DAMPING;
         for _ in 0..MAX_ROUNDS {
@@ -305,19 +314,20 @@ impl<'a> Adjustment<'a> {
         here.cost.is_finite().then_some((state, here))
     }
 
-    fn moved(&self, state: &State, step: &DVector<f64>) -> State {
+    fn moved(&self, state: &WindowState, step: &DVector<f64>) -> WindowState {
         let points = state.coefficients.len();
-        State {
+        WindowState {
             coefficients: &state.coefficients - step.rows(0, points),
             cameras: &state.cameras - step.rows(points, state.cameras.len()),
         }
     }
 
-    fn quadratic(&self, state: &State, density: i32, loss: Loss) -> Quadratic {
+    fn quadratic(&self, state: &WindowState, density: i32, loss: Loss) -> Quadratic {
         let mut quadratic = self.prior_quadratic(state, density);
         for sight in self.sights {
             let target = self.target(sight, state);
-            let Some(seen) = Seen::at(sight, target.place, self.scales[sight.camera]) else {
+            let Some(seen) = BearingResidual::at(sight, target.place, self.scales[sight.camera])
+            else {
                 // Behind the camera: as far off as can be.
                 quadratic.cost += loss.of(1e6).0;
                 continue;
@@ -332,7 +342,7 @@ impl<'a> Adjustment<'a> {
     }
 
     /// The prior's part of the cost: of the trajectory, and of clocks and poses.
-    fn prior_quadratic(&self, state: &State, density: i32) -> Quadratic {
+    fn prior_quadratic(&self, state: &WindowState, density: i32) -> Quadratic {
         let (points, cameras) = (state.coefficients.len(), state.cameras.len());
         let mut information = DMatrix::zeros(points + cameras, points + cameras);
         self.curve.add_prior(&mut information, jerk(density));
@@ -347,7 +357,7 @@ impl<'a> Adjustment<'a> {
     }
 
     /// Posterior covariance of clocks and poses, and their squared distance from the prior.
-    fn posterior(&self, state: &State, density: i32) -> Option<(DMatrix<f64>, f64)> {
+    fn posterior(&self, state: &WindowState, density: i32) -> Option<(DMatrix<f64>, f64)> {
         let (points, cameras) = (state.coefficients.len(), state.cameras.len());
         let information = self.quadratic(state, density, Loss::Trimmed).information;
         // The cameras' columns of A^-1: their covariance, with the trajectory marginalised.
@@ -373,7 +383,7 @@ fn jerk(power: i32) -> f64 {
 
 /// The residual of a bearing, with the target at a given place.
 #[derive(Clone, Copy, Debug)]
-struct Seen {
+struct BearingResidual {
     /// Squared Mahalanobis distance of the residual.
     squared: f64,
     /// With H as the derivative of the residual z by the place: H' R^-1 z, and H' R^-1 H.
@@ -381,9 +391,9 @@ struct Seen {
     information: Matrix3<f64>,
 }
 
-impl Seen {
+impl BearingResidual {
     /// `None` if the place lies behind the camera.
-    fn at(sight: &Sight, target: Vector3<f64>, scale: f64) -> Option<Self> {
+    fn at(sight: &WindowBearing, target: Vector3<f64>, scale: f64) -> Option<Self> {
         let residual: Vector2<f64> = sight.line.tangent_offset(target.into())?;
         let away = target - sight.line.origin.coords;
         let range = away.norm();
@@ -402,7 +412,13 @@ impl Seen {
 
 impl Quadratic {
     /// Adds a bearing; the cameras' components come after the `points` ones of the trajectory.
-    fn add(&mut self, target: &Target, points: usize, seen: &Seen, weight: f64) {
+    fn add(
+        &mut self,
+        target: &PredictedTarget,
+        points: usize,
+        seen: &BearingResidual,
+        weight: f64,
+    ) {
         let (pull, information) = (seen.pull * weight, seen.information * weight);
         let shifts = &target.shifts[..target.count];
         let Basis { first, place, .. } = target.basis;

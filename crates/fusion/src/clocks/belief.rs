@@ -29,7 +29,7 @@ struct UnsurePose {
 
 /// A camera's clock: index of its offset in the state, and what was reported of it.
 #[derive(Clone, Copy, Debug)]
-struct Clock {
+struct ClockEntry {
     /// Index of its offset from the reference; its drift is the next. `None` for the reference
     /// itself, the first camera heard.
     place: Option<usize>,
@@ -52,7 +52,7 @@ struct Clock {
 /// deviations alone.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Belief {
-    cameras: BTreeMap<CameraName, Clock>,
+    cameras: BTreeMap<CameraName, ClockEntry>,
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
     epoch: Option<Timestamp>,
@@ -93,7 +93,8 @@ impl Belief {
                 self.covariance[(place + i, place + i)] = common + own[i];
             }
         }
-        self.cameras.insert(camera.clone(), Clock { place, pose: None, prior, drift_prior, walk });
+        self.cameras
+            .insert(camera.clone(), ClockEntry { place, pose: None, prior, drift_prior, walk });
         self.settle();
         self.calibrate(camera, pose);
     }
@@ -131,7 +132,7 @@ impl Belief {
         self.cameras.values().filter_map(|clock| clock.place)
     }
 
-    fn reference(&self) -> Option<Clock> {
+    fn reference(&self) -> Option<ClockEntry> {
         self.cameras.values().find(|clock| clock.place.is_none()).copied()
     }
 
@@ -330,7 +331,7 @@ impl Belief {
     /// Forgets all that was learnt of any clock.
     pub(super) fn reset_all(&mut self) {
         let mut anew = Self { epoch: self.epoch, ..Self::default() };
-        let mut cameras: Vec<(&CameraName, &Clock)> = self.cameras.iter().collect();
+        let mut cameras: Vec<(&CameraName, &ClockEntry)> = self.cameras.iter().collect();
         // In the order in which they were heard: the reference first.
         cameras.sort_by_key(|(_, clock)| clock.place.map_or(0, |place| place + 1));
         for (camera, clock) in cameras {
@@ -343,7 +344,7 @@ impl Belief {
     /// Recomputes each clock's share in the common time, from the offsets now.
     fn settle(&mut self) {
         let clocks = self.cameras.values();
-        let stands = |clock: &Clock| ClockReading {
+        let stands = |clock: &ClockEntry| ClockReading {
             offset: self.relative(clock, 0, 0.0),
             variance: clock.prior,
         };
@@ -351,13 +352,13 @@ impl Belief {
     }
 
     /// The clocks, each with its share in the common time.
-    fn shares(&self) -> impl Iterator<Item = (&Clock, f64)> {
+    fn shares(&self) -> impl Iterator<Item = (&ClockEntry, f64)> {
         self.cameras.values().zip(self.common.shares.iter().copied())
     }
 
     /// A clock's offset (component 0) or drift (1) relative to the reference, the offset `ahead`
     /// seconds after the epoch.
-    fn relative(&self, clock: &Clock, component: usize, ahead: f64) -> f64 {
+    fn relative(&self, clock: &ClockEntry, component: usize, ahead: f64) -> f64 {
         clock.place.map_or(0.0, |place| match component {
             0 => self.mean[place] + ahead * self.mean[place + 1],
             _ => self.mean[place + 1],
@@ -370,7 +371,7 @@ impl Belief {
 
     /// A clock's offset (component 0) or drift (1) relative to the common time of all clocks, with
     /// its variance and the variance of that common time.
-    fn absolute(&self, clock: &Clock, component: usize, ahead: f64) -> (f64, f64, f64) {
+    fn absolute(&self, clock: &ClockEntry, component: usize, ahead: f64) -> (f64, f64, f64) {
         let common = match component {
             0 => self.common.variance,
             _ => self.shares().map(|(clock, share)| share.powi(2) * clock.drift_prior).sum(),
@@ -378,7 +379,7 @@ impl Belief {
         // Row vector h of x_clock - sum_k share_k x_k over the state, where the offset `ahead`
         // seconds later is offset + ahead * drift.
         let mut row: BTreeMap<usize, f64> = BTreeMap::new();
-        let mut put = |clock: &Clock, weight: f64| {
+        let mut put = |clock: &ClockEntry, weight: f64| {
             if let Some(place) = clock.place.filter(|_| weight != 0.0) {
                 *row.entry(place + component).or_default() += weight;
                 if component == 0 {
@@ -420,7 +421,7 @@ impl Belief {
     /// before its reported one.
     pub(super) fn largest_offset(&self, time: Timestamp) -> f64 {
         let ahead = self.ahead(time);
-        let offset = |clock: &Clock| self.relative(clock, 0, ahead);
+        let offset = |clock: &ClockEntry| self.relative(clock, 0, ahead);
         let common = self.shares().map(|(clock, share)| share * offset(clock)).sum::<f64>()
             - (self.site[0] + self.site[1] * ahead);
         self.cameras

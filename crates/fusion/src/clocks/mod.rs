@@ -21,7 +21,7 @@ use crossfix_message::{CameraName, ClockSource, Timestamp};
 use nalgebra::{Matrix2, Matrix6};
 
 use self::belief::Belief;
-use self::window::{Role, Window};
+use self::window::{Role, TrackWindow};
 use self::window_update::{WindowUpdate, window_update};
 use crate::config::Clocks;
 use crate::ingress::Exposure;
@@ -107,7 +107,7 @@ pub(crate) struct ClockEstimator {
     belief: Belief,
     /// The same, updated by what the open windows say so far.
     provisional: Option<Belief>,
-    windows: Vec<Window>,
+    windows: Vec<TrackWindow>,
     /// Largest relative deviation of a clock when the last window was closed, s.
     worst_sd_s: f64,
     /// What each camera reports of its clock.
@@ -251,7 +251,7 @@ impl ClockEstimator {
         let followed =
             |id: TrackId| tracker.track(id).is_some_and(|t| t.is_confirmed() && t.is_held());
         let now = self.now;
-        let full = |window: &Window| now.seconds_since(window.start) >= WINDOW_S;
+        let full = |window: &TrackWindow| now.seconds_since(window.start) >= WINDOW_S;
         if let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
             let window = self.windows.remove(index);
             self.close(&window);
@@ -289,7 +289,7 @@ impl ClockEstimator {
             let fast = track.state().velocity().norm() >= LEAST_SPEED;
             let worth = fast && track.is_confirmed() && track.is_held();
             (worth && self.windows.len() < MAX_WINDOWS).then(|| {
-                self.windows.push(Window::new(track.id, time));
+                self.windows.push(TrackWindow::new(track.id, time));
                 self.windows.len() - 1
             })
         });
@@ -340,7 +340,7 @@ impl ClockEstimator {
     }
 
     /// Keeps the result of a closed window.
-    fn close(&mut self, window: &Window) {
+    fn close(&mut self, window: &TrackWindow) {
         match window_update(&self.belief, window) {
             WindowUpdate::Accepted(belief) => {
                 self.belief = *belief;

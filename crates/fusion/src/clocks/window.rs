@@ -23,7 +23,7 @@ const MAX_SPAN_S: f64 = 30.0;
 
 /// A bearing of a target.
 #[derive(Clone, Debug)]
-pub(super) struct Sight {
+pub(super) struct WindowBearing {
     /// When it was taken by the camera's own clock, s after the window's beginning.
     pub(super) time_s: f64,
     /// Index of its camera in the window.
@@ -45,11 +45,11 @@ pub(super) enum Role {
 
 /// The bearings of a track.
 #[derive(Clone, Debug)]
-pub(super) struct Window {
+pub(super) struct TrackWindow {
     pub(super) track: TrackId,
     pub(super) start: Timestamp,
     pub(super) cameras: Vec<CameraName>,
-    pub(super) sights: Vec<Sight>,
+    pub(super) sights: Vec<WindowBearing>,
     /// One in this many bearings of each camera is taken.
     thinned: usize,
     /// Number of its cameras that are links.
@@ -58,7 +58,7 @@ pub(super) struct Window {
     offered: Vec<usize>,
 }
 
-impl Window {
+impl TrackWindow {
     pub(super) fn new(track: TrackId, start: Timestamp) -> Self {
         Self {
             track,
@@ -99,7 +99,7 @@ impl Window {
         let number = self.offered[index];
         self.offered[index] += 1;
         if number.is_multiple_of(self.thinned) {
-            self.sights.push(Sight { time_s, camera: index, line, place });
+            self.sights.push(WindowBearing { time_s, camera: index, line, place });
         }
         if self.sights.len() >= MAX_SIGHTS {
             self.thin();
@@ -153,9 +153,9 @@ impl Window {
     /// The window without the cameras that have given too few bearings to be checked.
     pub(super) fn checked(&self) -> Self {
         let kept = self.checked_indices();
-        let moved = |sight: &Sight| {
+        let moved = |sight: &WindowBearing| {
             let camera = kept.iter().position(|index| *index == sight.camera)?;
-            Some(Sight { camera, ..sight.clone() })
+            Some(WindowBearing { camera, ..sight.clone() })
         };
         Self {
             cameras: self.checked_cameras(),
@@ -175,7 +175,7 @@ mod tests {
 
     #[test]
     fn a_window_stays_bounded_and_spans_all_its_time() {
-        let mut window = Window::new(TrackId(1), Timestamp::EPOCH);
+        let mut window = TrackWindow::new(TrackId(1), Timestamp::EPOCH);
         let line = line_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0), 0.0).line;
         for k in 0..9000_u32 {
             let camera = ["a", "b", "c"][k as usize % 3].parse().unwrap();
@@ -195,7 +195,7 @@ mod tests {
 
     #[test]
     fn clocks_that_are_to_be_learnt_go_before_links() {
-        let mut window = Window::new(TrackId(1), Timestamp::EPOCH);
+        let mut window = TrackWindow::new(TrackId(1), Timestamp::EPOCH);
         let line = line_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0), 0.0).line;
         // Sixteen cameras, of which the last two are to be learnt, three times in half a second.
         for k in 0..60_u32 {

@@ -4,10 +4,10 @@
 use crossfix_message::CameraName;
 use nalgebra::DMatrix;
 
-use super::adjustment::{Adjusted, Adjustment, Prior, Unknowns};
+use super::adjustment::{AdjustedClocks, Adjustment, ClockPrior, Unknowns};
 use super::belief::Belief;
 use super::curve::Curve;
-use super::window::Window;
+use super::window::TrackWindow;
 
 /// Least span of a window, s: bearings of less say nothing that can be checked.
 const LEAST_WINDOW_S: f64 = 1.0;
@@ -50,11 +50,11 @@ pub(super) enum WindowUpdate {
 struct JumpTest<'a> {
     belief: Belief,
     components: Vec<usize>,
-    window: &'a Window,
+    window: &'a TrackWindow,
 }
 
 /// The belief after a window. If the window does not fit it well, a camera's clock may have jumped.
-pub(super) fn window_update(belief: &Belief, window: &Window) -> WindowUpdate {
+pub(super) fn window_update(belief: &Belief, window: &TrackWindow) -> WindowUpdate {
     let window = window.checked();
     let Some((_, last)) = window.span().filter(|(first, last)| last - first >= LEAST_WINDOW_S)
     else {
@@ -94,7 +94,7 @@ impl JumpTest<'_> {
             };
             let evidence = adjusted.evidence - JUMP;
             if best.as_ref().is_none_or(|(best, _)| evidence > best.evidence) {
-                best = Some((Adjusted { evidence, ..adjusted }, doubting));
+                best = Some((AdjustedClocks { evidence, ..adjusted }, doubting));
             }
         }
         if let Some((adjusted, belief)) = best {
@@ -109,7 +109,7 @@ impl JumpTest<'_> {
         })
     }
 
-    fn learnt(&self, mut belief: Belief, adjusted: &Adjusted) -> Belief {
+    fn learnt(&self, mut belief: Belief, adjusted: &AdjustedClocks) -> Belief {
         belief.learn(&self.components, &adjusted.cameras, &adjusted.covariance);
         belief
     }
@@ -117,9 +117,9 @@ impl JumpTest<'_> {
     /// The belief if a camera's clock has jumped in the first half of the window: its bearings of
     /// the second half then fit much better than all of them, and the clock as it was explains them
     /// no better.
-    fn jumped_within(&self, camera: &CameraName, plain: Option<&Adjusted>) -> Option<Belief> {
+    fn jumped_within(&self, camera: &CameraName, plain: Option<&AdjustedClocks>) -> Option<Belief> {
         let index = self.window.cameras.iter().position(|known| known == camera)?;
-        let strange = |adjusted: &Adjusted| adjusted.scales[index];
+        let strange = |adjusted: &AdjustedClocks| adjusted.scales[index];
         if plain.is_some_and(|plain| fits(plain) && strange(plain) < SUSPICIOUS_SCALE) {
             return None;
         }
@@ -137,7 +137,7 @@ impl JumpTest<'_> {
     }
 
     /// The cameras of the window whose clocks may have jumped, the least fitting first.
-    fn suspects(&self, adjusted: Option<&Adjusted>) -> Vec<&CameraName> {
+    fn suspects(&self, adjusted: Option<&AdjustedClocks>) -> Vec<&CameraName> {
         let strange = |index: usize| {
             adjusted.map_or(0.0, |adjusted| {
                 adjusted.scales[index] + MAX_SCALE * adjusted.outlier_shares[index]
@@ -154,7 +154,7 @@ impl JumpTest<'_> {
 }
 
 /// State components of a window's cameras: for each those of its clock, then those of its pose.
-fn components(belief: &Belief, window: &Window) -> Vec<usize> {
+fn components(belief: &Belief, window: &TrackWindow) -> Vec<usize> {
     let of_camera = |camera: &CameraName| {
         let clock = belief.place(camera).map(|place| place..place + 2);
         let pose = belief.pose(camera).map(|place| place..place + 6);
@@ -163,18 +163,18 @@ fn components(belief: &Belief, window: &Window) -> Vec<usize> {
     window.cameras.iter().flat_map(of_camera).collect()
 }
 
-fn fits(adjusted: &Adjusted) -> bool {
+fn fits(adjusted: &AdjustedClocks) -> bool {
     adjusted.scales.iter().all(|scale| *scale < MAX_SCALE)
         && adjusted.outlier_shares.iter().all(|share| *share < MAX_OUTLIERS)
 }
 
-fn is_suspicious(adjusted: &Adjusted) -> bool {
+fn is_suspicious(adjusted: &AdjustedClocks) -> bool {
     adjusted.scales.iter().any(|scale| *scale > SUSPICIOUS_SCALE)
         || adjusted.pulled > SUSPICIOUS_PULL * adjusted.cameras.len() as f64
 }
 
 /// Fits a window with the belief as the prior of clocks and poses.
-fn adjust(belief: &Belief, window: &Window, components: &[usize]) -> Option<Adjusted> {
+fn adjust(belief: &Belief, window: &TrackWindow, components: &[usize]) -> Option<AdjustedClocks> {
     let (mean, covariance) = belief.marginal(components);
     let mut next = 0;
     let mut room = |place: Option<usize>, size: usize| {
@@ -198,7 +198,7 @@ fn adjust(belief: &Belief, window: &Window, components: &[usize]) -> Option<Adju
     let last = times().fold(f64::NEG_INFINITY, f64::max) + margin;
     let precision: DMatrix<f64> = covariance.cholesky()?.inverse();
     let epoch_s = belief.epoch()?.seconds_since(window.start);
-    let prior = Prior { mean, precision, epoch_s, cameras };
+    let prior = ClockPrior { mean, precision, epoch_s, cameras };
     let reach = LONGEST_S + 2.0 * MAX_MARGIN_S;
     let curve = Curve::over(first, last.min(first + reach));
     Adjustment::new(&window.sights, curve, &prior).solve(FIRST_DENSITY)

@@ -15,7 +15,7 @@ const MOST_SIGHTINGS: usize = 100_000;
 /// Key by which exposures are ordered: two of a camera may be corrected to the same time, and the
 /// reported times tell them apart.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Place {
+struct QueueKey {
     time: Timestamp,
     camera: CameraName,
     reported: Timestamp,
@@ -40,7 +40,7 @@ struct Place {
 /// can be so far ahead).
 #[derive(Debug)]
 pub(crate) struct ReorderQueue<Note> {
-    waiting: BTreeMap<Place, (Exposure, Note)>,
+    waiting: BTreeMap<QueueKey, (Exposure, Note)>,
     sightings: usize,
 }
 
@@ -53,14 +53,14 @@ impl<Note> Default for ReorderQueue<Note> {
 impl<Note> ReorderQueue<Note> {
     /// Whether an exposure of this camera and these times waits.
     pub(crate) fn holds(&self, exposure: &Exposure, reported: Timestamp) -> bool {
-        let place = Place { time: exposure.time, camera: exposure.camera.clone(), reported };
+        let place = QueueKey { time: exposure.time, camera: exposure.camera.clone(), reported };
         self.waiting.contains_key(&place)
     }
 
     /// Takes an exposure in by its time, with the time that its camera reported, unless the same
     /// waits already.
     pub(crate) fn insert(&mut self, exposure: Exposure, reported: Timestamp, note: Note) {
-        let place = Place { time: exposure.time, camera: exposure.camera.clone(), reported };
+        let place = QueueKey { time: exposure.time, camera: exposure.camera.clone(), reported };
         if let Entry::Vacant(waiting) = self.waiting.entry(place) {
             self.sightings += exposure.sightings.len();
             waiting.insert((exposure, note));

@@ -39,8 +39,8 @@ fn a_frame_waits_for_the_slowest_camera() {
 #[test]
 fn frames_out_of_order_are_told_and_put_into_order() {
     let mut buffer = EventBuffer::new(EventTime::default());
-    assert_eq!(buffer.insert(exposure("a", 1.1)), Ok(Arrival::InOrder));
-    assert_eq!(buffer.insert(exposure("a", 1.0)), Ok(Arrival::OutOfOrder));
+    assert_eq!(buffer.insert(exposure("a", 1.1)), Ok(ExposureArrival::InOrder));
+    assert_eq!(buffer.insert(exposure("a", 1.0)), Ok(ExposureArrival::OutOfOrder));
     assert_eq!(buffer.insert(exposure("a", 1.1)), Err(RejectionReason::Duplicate));
     buffer.insert(exposure("b", 2.0)).unwrap();
     buffer.insert(exposure("a", 2.0)).unwrap();
@@ -57,7 +57,7 @@ fn what_is_overtaken_is_taken_until_something_later_is_worked_on() {
     buffer.release().unwrap().unwrap();
     buffer.pass(Timestamp::from_seconds(1.0));
     assert_eq!(buffer.release().unwrap().unwrap().time, Timestamp::from_seconds(1.2));
-    assert_eq!(buffer.insert(exposure("a", 1.1)), Ok(Arrival::OutOfOrder));
+    assert_eq!(buffer.insert(exposure("a", 1.1)), Ok(ExposureArrival::OutOfOrder));
     assert_eq!(buffer.release().unwrap().unwrap().time, Timestamp::from_seconds(1.1));
     buffer.pass(Timestamp::from_seconds(1.2));
     let late = buffer.insert(exposure("a", 1.15)).unwrap_err();
@@ -74,7 +74,7 @@ fn what_comes_at_the_time_of_the_last_is_taken_and_what_comes_twice_is_told_from
         buffer.insert(exposure(camera, time_s)).unwrap();
     }
     assert_eq!(drain(&mut buffer), [1.0, 1.0, 1.1, 1.1]);
-    assert_eq!(buffer.insert(exposure("b", 1.1)), Ok(Arrival::InOrder));
+    assert_eq!(buffer.insert(exposure("b", 1.1)), Ok(ExposureArrival::InOrder));
     assert_eq!(drain(&mut buffer), [1.1]);
     for (camera, time_s) in [("a", 1.0), ("b", 1.1), ("c", 1.1), ("c", 1.2)] {
         assert_eq!(buffer.insert(exposure(camera, time_s)), Err(RejectionReason::Duplicate));
@@ -314,7 +314,7 @@ fn backlog(
     buffer: &mut EventBuffer,
     until_s: f64,
     newest_first: bool,
-) -> Vec<(&'static str, Result<Arrival, RejectionReason>)> {
+) -> Vec<(&'static str, Result<ExposureArrival, RejectionReason>)> {
     let mut heard = Vec::new();
     let mut held_back = Vec::new();
     for k in 0..(30.0 * until_s) as u32 {

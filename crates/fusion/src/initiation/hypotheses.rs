@@ -12,9 +12,9 @@ use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
 use crate::cameras::Rooted;
 use crate::cameras::{Cameras, KnownCamera};
-use crate::motion::Motion;
+use crate::motion::TrackMotion;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
-use crate::track::{Expectation, Track, TrackId, TrackStatus};
+use crate::track::{Track, TrackExpectation, TrackId, TrackStatus};
 use crate::tracker::same_target;
 use crate::uncertainty::CameraUncertainty;
 use crate::visibility::log_missed;
@@ -93,10 +93,10 @@ impl Hypothesis {
 
 /// An exposure with what its lines are compared by.
 #[derive(Clone, Copy)]
-struct Context<'a> {
+struct HypothesisContext<'a> {
     exposure: &'a Exposure,
     known: &'a KnownCamera,
-    motion: &'a Motion,
+    motion: &'a TrackMotion,
     lines: &'a [NamedLine],
     uncertainty: CameraUncertainty,
     detection: f64,
@@ -137,7 +137,7 @@ impl Hypotheses {
         &mut self,
         exposures: &[&Exposure],
         cameras: &Cameras,
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> Vec<Start> {
         self.period += 1;
         for exposure in exposures {
@@ -167,14 +167,21 @@ impl Hypotheses {
     }
 
     /// Continues every hypothesis with each bearing in its gate, and without any.
-    fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &Motion) {
+    fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &TrackMotion) {
         let lines: Vec<NamedLine> = lines_of(exposure).collect();
         let uncertainty = CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty };
         let detection = self.tracking.detection_probability;
         let before = self.exposed.insert(exposure.camera.clone(), exposure.time);
         let interval_s = before.map_or(f64::INFINITY, |before| exposure.time.seconds_since(before));
-        let context =
-            Context { exposure, known, motion, lines: &lines, uncertainty, detection, interval_s };
+        let context = HypothesisContext {
+            exposure,
+            known,
+            motion,
+            lines: &lines,
+            uncertainty,
+            detection,
+            interval_s,
+        };
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for hypothesis in std::mem::take(&mut self.hypotheses) {
             self.extend_one(hypothesis, &context, &mut next);
@@ -188,11 +195,18 @@ impl Hypotheses {
     fn extend_one(
         &self,
         mut hypothesis: Hypothesis,
-        context: &Context<'_>,
+        context: &HypothesisContext<'_>,
         next: &mut Vec<Hypothesis>,
     ) {
-        let Context { exposure, known, motion, lines, uncertainty, detection, interval_s } =
-            *context;
+        let HypothesisContext {
+            exposure,
+            known,
+            motion,
+            lines,
+            uncertainty,
+            detection,
+            interval_s,
+        } = *context;
         let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
         let prediction = hypothesis.track.expectation(
             exposure.time,
@@ -219,7 +233,7 @@ impl Hypotheses {
             child.track.measurement_update(&exposure.camera, &line.line, time, motion)?;
             child.track.score += ratio;
             child.track.look(&exposure.camera, exposure.time, true, detection, motion);
-            if let Some(Expectation::Near(prediction)) = &prediction {
+            if let Some(TrackExpectation::Near(prediction)) = &prediction {
                 child.one_target.see(
                     &exposure.camera,
                     (&line.line, exposure.time, exposure.uncertainty.time_sd_s),
@@ -265,7 +279,7 @@ impl Hypotheses {
     }
 
     /// Starts a hypothesis from every seed.
-    fn begin(&mut self, seeds: Vec<Seed>, exposures: &[&Exposure], motion: &Motion) {
+    fn begin(&mut self, seeds: Vec<Seed>, exposures: &[&Exposure], motion: &TrackMotion) {
         let uncertainty: BTreeMap<&CameraName, CameraUncertainty> = exposures
             .iter()
             .map(|exposure| {
@@ -305,7 +319,7 @@ impl Hypotheses {
                 let expected = uncertainty.get(camera).and_then(|uncertainty| {
                     track.expectation(timed.time, seen_from, uncertainty, motion)
                 });
-                if let (Some(own), Some(Expectation::Near(prediction))) = (own, expected) {
+                if let (Some(own), Some(TrackExpectation::Near(prediction))) = (own, expected) {
                     one_target.begin_shift(camera, &own.line, &prediction);
                 }
             }
@@ -341,7 +355,7 @@ impl Hypotheses {
     /// have no rival. The log-likelihood ratio of one target against a target per camera must reach
     /// `pairs`, the logarithm of the number of pairs of lines that may look like one target by
     /// chance.
-    fn confirm(&mut self, now: Timestamp, pairs: f64, motion: &Motion) -> Vec<Start> {
+    fn confirm(&mut self, now: Timestamp, pairs: f64, motion: &TrackMotion) -> Vec<Start> {
         // Sorted by score: the rest have scores of 0 and less, which are never chosen.
         let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
         let scored = likely.map(|h| (h.track.score, h.lines.as_slice()));

@@ -19,8 +19,8 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Vector3;
 
 use crate::cameras::{Cameras, KnownCamera};
-use crate::cueing::Known;
-use crate::motion::Motion;
+use crate::cueing::CueTarget;
+use crate::motion::TrackMotion;
 use crate::papers::Grouped;
 use crate::spatial::{LineId, TimedLine};
 use crate::track::{Track, TrackId};
@@ -86,7 +86,7 @@ impl Initiator {
 
     /// The confirmed targets that one camera alone sees and no track covers, with their
     /// predictions.
-    pub(crate) fn known(&self, now: Timestamp) -> Vec<Known> {
+    pub(crate) fn known(&self, now: Timestamp) -> Vec<CueTarget> {
         match self.method {
             Method::Hypotheses(_) => self.handover.known(now),
             Method::Grouped(_) => Vec::new(),
@@ -100,7 +100,7 @@ impl Initiator {
         exposure: &Exposure,
         used: &[(usize, TrackId)],
         known: &KnownCamera,
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> Vec<Start> {
         match self.method {
             Method::Hypotheses(_) => self.handover.see(exposure, used, known, motion),
@@ -115,7 +115,7 @@ impl Initiator {
         exposure: Exposure,
         claims: &[(usize, TrackId)],
         cameras: &Cameras,
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> Vec<Start> {
         if let Method::Hypotheses(hypotheses) = &mut self.method {
             hypotheses.claim(&exposure, claims);

@@ -4,7 +4,7 @@
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
 
-use super::sight::Sight;
+use super::sight::DirectionFilter;
 use crate::prediction::BearingPrediction;
 use crate::spatial::TYPICAL_SPEED;
 use crate::visibility::independent_share;
@@ -25,7 +25,7 @@ const INCONCLUSIVE: f64 = 10.0;
 #[derive(Clone, Debug)]
 pub(super) struct OneTargetTest {
     /// Each camera's lines, followed as if that camera alone saw the target.
-    sights: Vec<(CameraName, Sight)>,
+    sights: Vec<(CameraName, DirectionFilter)>,
     /// Cameras that should see the target and never have, with the log-likelihood of their misses.
     silent: Vec<(CameraName, f64)>,
     log_ratio: f64,
@@ -43,7 +43,7 @@ impl OneTargetTest {
     ) -> Self {
         let sight = |(camera, line, time): (&CameraName, &SightLine, Timestamp)| {
             let range = (place - line.origin).norm();
-            (camera.clone(), Sight::first(line, time, speed / range))
+            (camera.clone(), DirectionFilter::first(line, time, speed / range))
         };
         Self {
             sights: lines.map(sight).collect(),
@@ -54,7 +54,7 @@ impl OneTargetTest {
     }
 
     /// The test for what one camera alone has followed so far.
-    pub(super) fn of_one(camera: &CameraName, sight: Sight) -> Self {
+    pub(super) fn of_one(camera: &CameraName, sight: DirectionFilter) -> Self {
         Self {
             sights: vec![(camera.clone(), sight)],
             silent: Vec::new(),
@@ -91,7 +91,7 @@ impl OneTargetTest {
         first_ratio: f64,
     ) {
         self.log_ratio += first_ratio;
-        self.sights.push((camera.clone(), Sight::first(line, time, rate_sd)));
+        self.sights.push((camera.clone(), DirectionFilter::first(line, time, rate_sd)));
     }
 
     /// Adds a line that continues the target as predicted. `first_ratio` is its log-likelihood

@@ -14,7 +14,7 @@ const MAX_PASSES: usize = 20;
 
 /// Bearings that may be one target's, and their score.
 #[derive(Clone, Debug)]
-struct Leaf {
+struct ScoredBearings {
     score: f64,
     /// The numbers of its lines, ascending.
     lines: Vec<usize>,
@@ -23,7 +23,7 @@ struct Leaf {
 /// All leaves, which lines they share, and the choice.
 #[derive(Clone, Debug)]
 pub(super) struct Selection {
-    leaves: Vec<Leaf>,
+    leaves: Vec<ScoredBearings>,
     /// The leaves that use a line, by the line's number.
     users: Vec<Vec<usize>>,
     shared_lines: usize,
@@ -54,7 +54,7 @@ impl Selection {
                 own.push(*numbers.entry(id).or_insert(next));
             }
             own.sort_unstable();
-            leaves.push(Leaf { score, lines: own });
+            leaves.push(ScoredBearings { score, lines: own });
         }
         let mut users = vec![Vec::new(); numbers.len()];
         for (i, leaf) in leaves.iter().enumerate() {

@@ -15,7 +15,7 @@ const PRIOR_COORDINATES: f64 = 10.0;
 /// Filter for the direction in which one camera alone follows a target: a constant turning rate
 /// driven by white acceleration.
 #[derive(Clone, Debug)]
-pub(super) struct Sight {
+pub(super) struct DirectionFilter {
     pub(super) direction: Unit<Vector3<f64>>,
     /// Turning rate of the direction, rad/s.
     pub(super) rate: Vector3<f64>,
@@ -35,7 +35,7 @@ pub(super) struct Sight {
     coordinates: f64,
 }
 
-impl Sight {
+impl DirectionFilter {
     /// The filter after a first line, of a target that may move across it at `rate_sd` (rad/s).
     pub(super) fn first(line: &SightLine, time: Timestamp, rate_sd: f64) -> Self {
         Self {

@@ -21,13 +21,13 @@ pub(super) const KEPT_EVERY_S: f64 = 0.2;
 
 /// Where a track was lately.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Past {
+pub(super) struct PastPlaces {
     newest: Option<(Timestamp, KinematicState)>,
     /// Some of the states that were the newest before, the oldest first.
     kept: VecDeque<(Timestamp, KinematicState)>,
 }
 
-impl Past {
+impl PastPlaces {
     pub(super) fn add(&mut self, time: Timestamp, state: &KinematicState) {
         self.newest = Some((time, state.clone()));
         match self.kept.back().map(|(last, _)| time.seconds_since(*last)) {
@@ -57,7 +57,7 @@ pub(super) struct Theirs {
     pub(super) time: Timestamp,
     /// The time here when it was heard.
     pub(super) heard: Option<Timestamp>,
-    pub(super) past: Past,
+    pub(super) past: PastPlaces,
     pub(super) grip: Grip,
     pub(super) born: Timestamp,
 }
@@ -71,7 +71,7 @@ pub(super) struct Ours {
     /// Its number and its beginning before it took another's.
     pub(super) first: (Number, Timestamp),
     pub(super) voice: Voice,
-    pub(super) past: Past,
+    pub(super) past: PastPlaces,
     pub(super) compared: Option<Timestamp>,
     pub(super) ended: Option<Timestamp>,
     /// What has happened to it and is to be said when the track itself is said.
@@ -85,7 +85,7 @@ impl Ours {
             born: now,
             first: (number, now),
             voice: Voice::Unsaid,
-            past: Past::default(),
+            past: PastPlaces::default(),
             compared: None,
             ended: None,
             untold: Vec::new(),

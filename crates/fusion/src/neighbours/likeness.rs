@@ -27,11 +27,11 @@ const DENSITY: f64 = 1e-6;
 const CLEARLY: f64 = 100.0;
 
 /// A track of a neighbour: which neighbour, and under which number it says it.
-pub(super) type Said = (usize, Number);
+pub(super) type NeighbourTrack = (usize, Number);
 
 /// How well the places of two tracks have agreed lately, as means over about [`LONG_ENOUGH_S`].
 #[derive(Clone, Copy, Debug)]
-struct Likeness {
+struct TrackLikeness {
     since: Timestamp,
     seen: Timestamp,
     /// Squared Mahalanobis distance.
@@ -42,7 +42,7 @@ struct Likeness {
     cost: f64,
 }
 
-impl Likeness {
+impl TrackLikeness {
     fn is_of_late(&self, now: Timestamp) -> bool {
         (0.0..LONG_ENOUGH_S).contains(&now.seconds_since(self.seen))
     }
@@ -61,14 +61,14 @@ impl Likeness {
 
 /// All pairs of tracks that may be of one target.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Likenesses(BTreeMap<(Own, Said), Likeness>);
+pub(super) struct Likenesses(BTreeMap<(Own, NeighbourTrack), TrackLikeness>);
 
 impl Likenesses {
     /// Compares two states of one time; `is_one` is for tracks that are said under one number,
     /// whose pair is kept whatever comes out.
     pub(super) fn see(
         &mut self,
-        pair: (Own, Said),
+        pair: (Own, NeighbourTrack),
         is_one: bool,
         [here, there]: [&KinematicState; 2],
         now: Timestamp,
@@ -84,7 +84,7 @@ impl Likenesses {
         // -2 ln N(d; 0, S) = d' S^-1 d + ln det S, less a constant.
         let distance = apart.dot(&factor.solve(&apart)).min(MOST);
         let cost = distance + 2.0 * factor.l().diagonal().map(f64::ln).sum();
-        let new = Likeness { since: now, seen: now, distance, cost };
+        let new = TrackLikeness { since: now, seen: now, distance, cost };
         let known = self.0.entry(pair).or_insert(new);
         if !known.is_of_late(now) {
             *known = new;
@@ -98,16 +98,20 @@ impl Likenesses {
         }
     }
 
-    fn of_own(&self, own: Own) -> impl Iterator<Item = (Said, &Likeness)> {
+    fn of_own(&self, own: Own) -> impl Iterator<Item = (NeighbourTrack, &TrackLikeness)> {
         let all = (own, (0, Number(0)))..=(own, (usize::MAX, Number(u64::MAX)));
         self.0.range(all).map(|((_, said), likeness)| (*said, likeness))
     }
 
     /// The neighbours' tracks that are beyond doubt of the same target as one here: at most one per
     /// neighbour, as each has one track of a target.
-    pub(super) fn same_as(&self, own: Own, now: Timestamp) -> impl Iterator<Item = Said> + '_ {
-        let is_sure = move |(said, likeness): &(Said, &Likeness)| {
-            let is_rival = |other: &Likeness| {
+    pub(super) fn same_as(
+        &self,
+        own: Own,
+        now: Timestamp,
+    ) -> impl Iterator<Item = NeighbourTrack> + '_ {
+        let is_sure = move |(said, likeness): &(NeighbourTrack, &TrackLikeness)| {
+            let is_rival = |other: &TrackLikeness| {
                 other.is_of_late(now) && other.cost < likeness.cost + 2.0 * CLEARLY.ln()
             };
             let mut of_neighbour = self.of_own(own).filter(|(other, _)| other.0 == said.0);
@@ -127,12 +131,12 @@ impl Likenesses {
     }
 
     /// Whether two tracks that are said under one number are near enough to be of one target.
-    pub(super) fn may_be_one(&self, own: Own, said: Said) -> bool {
+    pub(super) fn may_be_one(&self, own: Own, said: NeighbourTrack) -> bool {
         self.0.get(&(own, said)).is_some_and(|likeness| likeness.distance < PARTED)
     }
 
     /// Whether two tracks that are said under one number are of two targets, beyond doubt.
-    pub(super) fn have_parted(&self, own: Own, said: Said) -> bool {
+    pub(super) fn have_parted(&self, own: Own, said: NeighbourTrack) -> bool {
         let likeness = self.0.get(&(own, said));
         likeness.is_some_and(|likeness| likeness.has_lasted() && likeness.distance > PARTED)
     }

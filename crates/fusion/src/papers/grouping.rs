@@ -126,7 +126,7 @@ impl Group {
 
 /// A group as it would be, before it is made: where all fixes are alike there are millions.
 #[derive(Clone, Copy, Debug)]
-struct Candidate {
+struct CandidateGroup {
     fixes: usize,
     indicator: f64,
     /// Its origin: 0 an old group, 1 an old group with one fix more, 2 a new one; then the index of
@@ -136,7 +136,7 @@ struct Candidate {
 
 /// Keeps the best candidates, those with the most fixes first, then those with the least
 /// indicators.
-fn keep_best(candidates: &mut Vec<Candidate>) {
+fn keep_best(candidates: &mut Vec<CandidateGroup>) {
     candidates.sort_by(|a, b| {
         b.fixes.cmp(&a.fixes).then(a.indicator.total_cmp(&b.indicator)).then(a.from.cmp(&b.from))
     });
@@ -172,14 +172,14 @@ impl Grouping {
         let mut candidates = Vec::new();
         for (index, group) in self.groups.iter().enumerate() {
             // A group without a fix in this period stays open for the next.
-            candidates.push(Candidate {
+            candidates.push(CandidateGroup {
                 fixes: group.fixes.len(),
                 indicator: group.indicator,
                 from: (0, index, 0),
             });
             for (place, fix) in fixes.iter().enumerate() {
                 if let Some(residual) = self.residual(group, fix) {
-                    candidates.push(Candidate {
+                    candidates.push(CandidateGroup {
                         fixes: group.fixes.len() + 1,
                         indicator: group.indicator + residual,
                         from: (1, index, place),
@@ -190,7 +190,7 @@ impl Grouping {
                 keep_best(&mut candidates);
             }
         }
-        let begin = |place| Candidate { fixes: 1, indicator: 0.0, from: (2, 0, place) };
+        let begin = |place| CandidateGroup { fixes: 1, indicator: 0.0, from: (2, 0, place) };
         candidates.extend((0..fixes.len()).map(begin));
         keep_best(&mut candidates);
         let grown = candidates.into_iter().map(|candidate| match candidate.from {

@@ -6,8 +6,8 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Point3;
 
 use super::{Track, log_range_sd};
-use crate::motion::Motion;
-use crate::prediction::{BearingPrediction, Fit};
+use crate::motion::TrackMotion;
+use crate::prediction::{BearingFit, BearingPrediction};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
 
@@ -15,7 +15,7 @@ use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
 // Made and used in one exposure: never stored, so the size of the larger variant costs nothing.
 #[allow(clippy::large_enum_variant)]
 #[derive(Clone, Debug)]
-pub(crate) enum Expectation {
+pub(crate) enum TrackExpectation {
     /// The range is known: one predicted direction with its covariance.
     Near(BearingPrediction),
     /// The range is unknown: the prediction is a stripe along another camera's sight line, and each
@@ -32,20 +32,20 @@ pub(crate) enum Expectation {
     },
 }
 
-impl Expectation {
+impl TrackExpectation {
     /// How well a bearing fits; `None` if it lies outside the gate.
-    pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
+    pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<BearingFit> {
         match self {
             Self::Near(prediction) => prediction.fit(line, gate),
             Self::Along { state, seen_from, camera, errors } => {
                 let fit = |errors: &SharedErrors| {
                     let Updated { nis, log_likelihood, .. } =
                         updated(state, Some(*seen_from), &Measured { line, camera, errors })?;
-                    let fit = Fit { gate_distance: nis, log_density: log_likelihood };
+                    let fit = BearingFit { gate_distance: nis, log_density: log_likelihood };
                     gate.holds(nis).then_some(fit)
                 };
                 let Some((anew, probability)) = errors.renewed() else { return fit(errors) };
-                Fit::likelier(fit(errors), fit(&anew), probability)
+                BearingFit::likelier(fit(errors), fit(&anew), probability)
             }
         }
     }
@@ -59,19 +59,24 @@ impl Track {
         time: Timestamp,
         (camera, origin): (&CameraName, Point3<f64>),
         uncertainty: &CameraUncertainty,
-        motion: &Motion,
-    ) -> Option<Expectation> {
+        motion: &TrackMotion,
+    ) -> Option<TrackExpectation> {
         let interval = time.seconds_since(self.updated);
         let errors = self.errors_of(camera, interval);
         let follower = self.follower.filter(|follower| !self.held && *follower != origin);
         if let Some(seen_from) = follower {
             let state = self.predicted(time, motion);
             if log_range_sd(&state, seen_from) > VAGUE_LOG_RANGE_SD {
-                return Some(Expectation::Along { state, seen_from, camera: *uncertainty, errors });
+                return Some(TrackExpectation::Along {
+                    state,
+                    seen_from,
+                    camera: *uncertainty,
+                    errors,
+                });
             }
         }
         let models = motion.models(self.ranged);
         BearingPrediction::new(&self.imm, interval, models, origin, uncertainty, &errors)
-            .map(Expectation::Near)
+            .map(TrackExpectation::Near)
     }
 }

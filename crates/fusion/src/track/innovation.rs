@@ -6,11 +6,11 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Vector2;
 
 use super::Track;
-use crate::motion::{Detector, Motion};
+use crate::motion::{ManoeuvreDetector, TrackMotion};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
 /// The innovation of a bearing.
-pub(super) struct Innovation {
+pub(super) struct BearingInnovation {
     pub(super) offset: Vector2<f64>,
     pub(super) model: BearingModel,
 }
@@ -25,8 +25,12 @@ struct Against<'a> {
 impl Against<'_> {
     /// The squared Mahalanobis distance of an innovation, and the determinant of its covariance,
     /// rad^4, by what is known of the camera's errors.
-    fn distance(&self, innovation: &Innovation, errors: &SharedErrors) -> Option<(f64, f64)> {
-        let Innovation { offset, model } = innovation;
+    fn distance(
+        &self,
+        innovation: &BearingInnovation,
+        errors: &SharedErrors,
+    ) -> Option<(f64, f64)> {
+        let BearingInnovation { offset, model } = innovation;
         let by = model.by_position();
         let shifts = self.uncertainty.shifts(model, self.before.velocity());
         // S = H P H' + H X J' + J X' H' + J W J' + f R: the camera's errors (effect J, covariance
@@ -45,20 +49,24 @@ impl Against<'_> {
 
 impl Track {
     /// The innovation of a bearing; `None` if it points away from the target.
-    pub(super) fn innovation(&self, time: Timestamp, line: &SightLine) -> Option<Innovation> {
+    pub(super) fn innovation(
+        &self,
+        time: Timestamp,
+        line: &SightLine,
+    ) -> Option<BearingInnovation> {
         let model = BearingModel::new(line.origin, self.position_at(time))?;
-        Some(Innovation { offset: model.offset(line)?, model })
+        Some(BearingInnovation { offset: model.offset(line)?, model })
     }
 
     /// The innovation's squared Mahalanobis distance; the reported covariance counts by the factor
     /// that was found for the camera.
     fn nis(
         &self,
-        innovation: &Innovation,
+        innovation: &BearingInnovation,
         interval: f64,
         (camera, line): (&CameraName, &SightLine),
         uncertainty: &CameraUncertainty,
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> Option<f64> {
         let before = self.imm.predicted(interval, motion.models(self.ranged));
         let errors = self.errors_of(camera, interval);
@@ -70,11 +78,11 @@ impl Track {
     /// have been drawn again; `None` if it does not.
     pub(super) fn renewed(
         &self,
-        innovation: &Innovation,
+        innovation: &BearingInnovation,
         interval: f64,
         (line, errors): (&SightLine, &SharedErrors),
         uncertainty: &CameraUncertainty,
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> Option<SharedErrors> {
         let (anew, probability) = errors.renewed()?;
         let before = self.imm.predicted(interval, motion.models(self.ranged));
@@ -91,20 +99,20 @@ impl Track {
     /// Whether the manoeuvre detector fires on a bearing.
     pub(super) fn sees_manoeuvre(
         &mut self,
-        innovation: &Innovation,
+        innovation: &BearingInnovation,
         interval: f64,
         (camera, line): (&CameraName, &SightLine),
         uncertainty: &CameraUncertainty,
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> bool {
-        let nis = matches!(self.detector, Some(Detector::Innovation(_)))
+        let nis = matches!(self.detector, Some(ManoeuvreDetector::Innovation(_)))
             .then(|| self.nis(innovation, interval, (camera, line), uncertainty, motion))
             .flatten();
         self.detector.as_mut().is_some_and(|detector| match detector {
-            Detector::Residual(detector) => {
+            ManoeuvreDetector::Residual(detector) => {
                 detector.see(innovation.model.basis * innovation.offset / line.standard_deviation())
             }
-            Detector::Innovation(detector) => nis.is_some_and(|nis| detector.see(nis, 2)),
+            ManoeuvreDetector::Innovation(detector) => nis.is_some_and(|nis| detector.see(nis, 2)),
         })
     }
 }

@@ -9,7 +9,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2x5, Matrix6, Matrix6x2, Vector6};
 
 use super::Track;
-use crate::motion::Motion;
+use crate::motion::TrackMotion;
 use crate::uncertainty::{LASTING, SharedTies};
 use crate::update::Told;
 
@@ -19,7 +19,7 @@ const CLOSEST: f64 = 1.0 - 1e-9;
 
 /// The state of a track at an earlier time, with what later bearings tell of it.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Past {
+pub(super) struct PastState {
     time: Timestamp,
     state: KinematicState,
     /// Covariance of the track's state at `carried_to` (rows) with this past state (columns).
@@ -31,7 +31,7 @@ pub(super) struct Past {
     ties: Vec<(CameraName, SharedTies)>,
 }
 
-impl Past {
+impl PastState {
     /// Carries `with_now` on to a later present time: the position moves with the velocity.
     fn pass(&mut self, to: Timestamp, interval: f64) {
         let velocity = self.with_now.fixed_rows::<3>(3).into_owned();
@@ -53,7 +53,7 @@ impl Past {
 
     /// Updates the past state with a bearing of a camera; `seen` says how the bearing is correlated
     /// with each camera's errors.
-    fn learn(&mut self, camera: &CameraName, told: &Told, seen: &[Seen<'_>]) {
+    fn learn(&mut self, camera: &CameraName, told: &Told, seen: &[BearingCovariance<'_>]) {
         let own = *self.ties_to(camera);
         // A = cov(past, bearing) = N' H' + X J', with N = `with_now` and X the ties to the
         // bearing's camera. Mean += A S^-1 z; covariance -= A (S^-1 - spread over the models) A'.
@@ -73,7 +73,7 @@ impl Past {
         self.with_now = told.carried * self.with_now - told.gained * own.transpose()
             + told.moved * across.transpose();
         let gain = across * told.weight;
-        for Seen { camera, by_errors, is_learnt } in seen {
+        for BearingCovariance { camera, by_errors, is_learnt } in seen {
             let change = if *is_learnt {
                 let mut change = gain * by_errors;
                 let mut lasting = change.fixed_columns_mut::<2>(LASTING);
@@ -117,7 +117,7 @@ impl Past {
 }
 
 /// The covariance of a bearing with the shared errors of one camera.
-struct Seen<'a> {
+struct BearingCovariance<'a> {
     camera: &'a CameraName,
     by_errors: Matrix2x5<f64>,
     /// Whether the camera's lasting errors are learnt.
@@ -126,13 +126,13 @@ struct Seen<'a> {
 
 impl Track {
     /// Stores the track's state at a time, so that later bearings can smooth it.
-    pub(crate) fn remember(&mut self, time: Timestamp, motion: &Motion) {
+    pub(crate) fn remember(&mut self, time: Timestamp, motion: &TrackMotion) {
         let state = self.predicted(time, motion);
         let interval = time.seconds_since(self.updated);
         let ties =
             self.ties.iter().map(|(name, ties)| (name.clone(), ties.predicted(interval))).collect();
         let with_now = state.covariance;
-        self.past.push_back(Past {
+        self.past.push_back(PastState {
             time,
             state,
             with_now,
@@ -166,7 +166,7 @@ impl Track {
     }
 
     /// The stored states that later bearings still change.
-    fn open_past(&mut self) -> impl Iterator<Item = &mut Past> {
+    fn open_past(&mut self) -> impl Iterator<Item = &mut PastState> {
         self.past.iter_mut().filter(|past| !past.is_settled)
     }
 
@@ -189,10 +189,10 @@ impl Track {
         if self.past.is_empty() {
             return;
         }
-        let seen: Vec<Seen<'_>> = self
+        let seen: Vec<BearingCovariance<'_>> = self
             .ties
             .iter()
-            .map(|(name, ties)| Seen {
+            .map(|(name, ties)| BearingCovariance {
                 camera: name,
                 by_errors: told.by * ties.covariance + told.shifts * self.between(camera, name),
                 is_learnt: self.learns(name),
@@ -213,7 +213,7 @@ impl Track {
     /// Freezes all stored states: the target may now be anywhere, and later bearings tell nothing
     /// of them.
     pub(super) fn settle_past(&mut self) {
-        self.past.iter_mut().for_each(Past::settle);
+        self.past.iter_mut().for_each(PastState::settle);
     }
 
     /// Drops the stored states' ties to a camera's lasting errors, which have been drawn again.

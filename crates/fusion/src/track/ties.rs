@@ -10,15 +10,15 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Unit, Vector2, Vector3};
 
 use super::learnt::LearntTies;
-use super::{Innovation, Track};
-use crate::cameras::{ClockChange, LastThree, Sample};
-use crate::motion::Motion;
-use crate::uncertainty::{CameraUncertainty, LASTING, LastingNoise, OF_CLOCK, OF_POSE, SharedTies};
+use super::{BearingInnovation, Track};
+use crate::cameras::{ClockChange, LastThree, ScaleSample};
+use crate::motion::TrackMotion;
+use crate::uncertainty::{CameraUncertainty, LASTING, OF_CLOCK, OF_POSE, SharedNoise, SharedTies};
 use crate::update::{Told, Updated};
 use crate::visibility::Visibility;
 
 /// Longest interval between bearings whose third difference is used, as a share of the holding time
-/// ([`Motion::holding_s`], how long after a bearing its camera still supports the track): over
+/// ([`TrackMotion::holding_s`], how long after a bearing its camera still supports the track): over
 /// longer intervals noise cannot be told from jerk.
 const CLOSE_BEARINGS: f64 = 0.1;
 /// A draw (one comparison of the cameras' mean offsets from the target) lasts this long, s: long
@@ -82,7 +82,7 @@ pub(super) struct Drawn {
     /// Covariance of one bearing's noise, rad^2.
     noise: Matrix2<f64>,
     /// The part of the noise that lasts, and so is not averaged away.
-    lasting: LastingNoise,
+    lasting: SharedNoise,
     pose: Matrix2<f64>,
     by_pose: Matrix2x6<f64>,
     clock: Vector2<f64>,
@@ -94,7 +94,7 @@ impl Drawn {
     /// The sums with one bearing more.
     fn with(
         before: Option<Self>,
-        (innovation, velocity): (&Innovation, Vector3<f64>),
+        (innovation, velocity): (&BearingInnovation, Vector3<f64>),
         line: &SightLine,
         uncertainty: &CameraUncertainty,
     ) -> Self {
@@ -115,7 +115,7 @@ impl Drawn {
 
     /// The mean offset as a sample, for a target whose velocity has a standard deviation of
     /// `speed`, m/s.
-    fn sample(self, camera: &CameraName, speed: f64) -> Sample {
+    fn sample(self, camera: &CameraName, speed: f64) -> ScaleSample {
         let moved = self.by_position * (speed * DRAW_S / 10.0);
         // White noise averages out over the bearings; what an unknown velocity does within a draw
         // does not.
@@ -123,7 +123,7 @@ impl Drawn {
         // The clock's effect is computed with the estimated velocity, and is as uncertain as that.
         let by_speed = self.by_position * (speed * self.time_sd_s);
         let lasting = Matrix2::identity() * self.lasting.as_white(DRAW_S);
-        Sample {
+        ScaleSample {
             camera: camera.clone(),
             offset: self.offsets / self.count,
             by_position: self.by_position,
@@ -153,7 +153,7 @@ impl Ties {
         Self {
             covariance: SharedTies::zeros(),
             learnt: LearntTies::zeros(0),
-            lasting_s: LastingNoise::NONE.time_s,
+            lasting_s: SharedNoise::NONE.time_s,
             visibility: Visibility::new(time),
             seen: None,
             period_s: 0.0,
@@ -165,7 +165,7 @@ impl Ties {
     }
 
     /// For a camera whose bearing is one of those that the track starts from.
-    pub(super) fn begun(time: Timestamp, covariance: SharedTies, lasting: LastingNoise) -> Self {
+    pub(super) fn begun(time: Timestamp, covariance: SharedTies, lasting: SharedNoise) -> Self {
         let lasting_s = lasting.time_s;
         Self {
             covariance,
@@ -240,7 +240,7 @@ impl Track {
     pub(super) fn gather(
         &mut self,
         camera: &CameraName,
-        innovation: &Innovation,
+        innovation: &BearingInnovation,
         line: &SightLine,
         uncertainty: &CameraUncertainty,
     ) {
@@ -271,7 +271,7 @@ impl Track {
     /// at least as many cameras as see the target have for long had something beside it in the same
     /// place, that is the target, and their poses are worse than stated: these offsets are then
     /// included.
-    pub(crate) fn draw(&mut self) -> Vec<Sample> {
+    pub(crate) fn draw(&mut self) -> Vec<ScaleSample> {
         if self.updated.seconds_since(self.drawn) < DRAW_S {
             return Vec::new();
         }
@@ -347,7 +347,7 @@ impl Track {
         &mut self,
         camera: &CameraName,
         line: &SightLine,
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> Option<f64> {
         let (now, state) = (self.updated, self.imm.combined());
         let (place, velocity) = (state.position(), state.velocity());
@@ -362,7 +362,7 @@ impl Track {
     /// mean over the models; returns the bearing's mean squared Mahalanobis distance.
     pub(super) fn carry(
         &mut self,
-        (camera, lasting): (&CameraName, LastingNoise),
+        (camera, lasting): (&CameraName, SharedNoise),
         (time, interval): (Timestamp, f64),
         results: &[Option<Updated>],
     ) -> f64 {

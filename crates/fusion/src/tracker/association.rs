@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use crossfix_message::TrackEventKind;
 
 use super::{Noted, TrackChange, Tracker};
-use crate::assignment::{Candidate, assign};
+use crate::assignment::{Pairing, assign};
 use crate::cameras::Fitting;
 use crate::cameras::KnownCamera;
 use crate::reacquisition::FOUND_AGAIN_MARGIN;
@@ -120,7 +120,7 @@ impl Tracker {
         known: &KnownCamera,
         owners: &[Option<TrackId>],
         ids: &[TrackId],
-    ) -> Vec<Candidate> {
+    ) -> Vec<Pairing> {
         // Least log-density of a bearing that is to update a track which this camera has lost sight
         // of.
         let stranger = exposure.clutter_per_sr.ln() + FOUND_AGAIN_MARGIN;
@@ -150,7 +150,7 @@ impl Tracker {
                 if let Some(fit) = fit.filter(|fit| !lost_sight || fit.log_density > stranger) {
                     let gain = fit.log_ratio(visible * detection, exposure.clutter_per_sr)
                         - log_missed(visible, detection);
-                    candidates.push(Candidate { row, column, gain });
+                    candidates.push(Pairing { row, column, gain });
                 }
             }
         }

@@ -315,7 +315,7 @@ impl Level {
             let change = self.change.row_mut(y);
             change.fill(0.0);
             for [from, to] in free_of(known, y, width) {
-                update.learn(Row {
+                update.learn(BackgroundRow {
                     now: &self.now.row(y)[from..to],
                     textures: &self.scratch[from..to],
                     mean: &mut self.mean.row_mut(y)[from..to],
@@ -364,7 +364,7 @@ struct CellUpdate {
 
 /// One row of the background, or a part of it.
 #[derive(Debug)]
-struct Row<'a> {
+struct BackgroundRow<'a> {
     now: &'a [f32],
     textures: &'a [f32],
     mean: &'a mut [f32],
@@ -388,7 +388,7 @@ impl CellUpdate {
         });
     }
 
-    fn learn(self, row: Row<'_>) {
+    fn learn(self, row: BackgroundRow<'_>) {
         let Self { share, noise, contrast, .. } = self;
         Arch::new().dispatch(|| {
             let learnt = row.mean.iter_mut().zip(row.variance).zip(row.change);

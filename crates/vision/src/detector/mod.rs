@@ -72,7 +72,7 @@ const NEW_S: f64 = 0.5;
 
 /// A target that is followed already.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Known {
+pub(crate) struct KnownTarget {
     pub(crate) id: ImageTrackId,
     pub(crate) place: PixelBox,
     /// Whether the background at its place is known from before it came.
@@ -97,7 +97,7 @@ pub(crate) struct Findings {
 
 /// A known target that may turn out to be the scene.
 #[derive(Clone, Copy, Debug)]
-struct Watch {
+struct SceneWatch {
     id: ImageTrackId,
     /// Index of the scale that fits its size.
     level: usize,
@@ -118,7 +118,7 @@ pub(crate) struct Detector {
     age_s: f64,
     plots: Vec<Plot>,
     candidates: Candidates,
-    watches: Vec<Watch>,
+    watches: Vec<SceneWatch>,
 }
 
 impl Detector {
@@ -142,7 +142,7 @@ impl Detector {
         image: &Plane,
         interval: f64,
         turned: [f64; 2],
-        known: &[Known],
+        known: &[KnownTarget],
     ) -> Findings {
         if self.sides != [image.width(), image.height()] {
             *self = Self::new(self.config.clone());
@@ -179,7 +179,7 @@ impl Detector {
     }
 
     /// Notes by how much each watched target stands out, before it is covered.
-    fn watch(&mut self, known: &[Known]) {
+    fn watch(&mut self, known: &[KnownTarget]) {
         self.watches
             .retain(|watch| known.iter().any(|known| known.id == watch.id && known.is_watched));
         for known in known.iter().filter(|known| known.is_watched) {
@@ -196,7 +196,7 @@ impl Detector {
                 Some(watch) => {
                     (watch.level, watch.place, watch.stands_out) = (level, place, stands_out);
                 }
-                None => self.watches.push(Watch {
+                None => self.watches.push(SceneWatch {
                     id: known.id,
                     level,
                     place,
@@ -208,7 +208,7 @@ impl Detector {
     }
 
     /// Takes the image into the background of every scale, except where known targets are.
-    fn learn(&mut self, interval: f64, turned: [f64; 2], known: &[Known]) {
+    fn learn(&mut self, interval: f64, turned: [f64; 2], known: &[KnownTarget]) {
         // A young background is the plain mean of its images; an old one forgets exponentially.
         let young = 1.0 / (f64::from(self.images) + 1.0);
         let share = young.max(1.0 - (-interval / self.config.background_s).exp()) as f32;
@@ -251,7 +251,7 @@ impl Detector {
         image: &Plane,
         interval: f64,
         turned: [f64; 2],
-        known: &[Known],
+        known: &[KnownTarget],
     ) -> Vec<Found> {
         plots::find(&mut self.levels, &mut self.plots);
         self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));

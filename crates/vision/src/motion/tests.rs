@@ -16,7 +16,7 @@ struct Flight {
     position: [f64; 2],
     velocity: [f64; 2],
     offset: [f64; 2],
-    motion: Motion,
+    motion: ImageMotion,
     images: f64,
 }
 
@@ -32,7 +32,7 @@ impl Flight {
         // The first image's own noise puts the target beside the reference's middle.
         let offset = [0, 1].map(|i| given[i].position - position[i] - NOISE_SD * normal());
         let velocity = [20.0 * normal(), 20.0 * normal()];
-        let motion = Motion::at_rest(given, 20.0, 900.0);
+        let motion = ImageMotion::at_rest(given, 20.0, 900.0);
         Self { position, velocity, offset, motion, images: 1.0, rng }
     }
 
@@ -54,7 +54,7 @@ impl Flight {
         });
         self.motion.tell_noise([variance; 2]);
         let nis = self.motion.nis(at);
-        self.motion.update(&Evidence::of(at));
+        self.motion.update(&PlaceEvidence::of(at));
         self.motion.match_noise(nis);
         let place = self.motion.position();
         let share = if self.images < 20.0 { 1.0 / (self.images + 1.0) } else { 0.0 };

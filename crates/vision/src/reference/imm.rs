@@ -38,18 +38,19 @@ impl Default for ImmConfig {
 
 /// A model's transition `B = [[1, rate], [0, keep]]` and noise `M = [[m11, m12], [m12, m22]]`.
 #[derive(Clone, Copy, Debug)]
-struct Model {
+struct PixelModel {
     rate: f32,
     keep: f32,
     noise: [f32; 3],
 }
 
 impl ImmConfig {
-    fn models(&self, interval: f32) -> [Model; MODELS] {
-        let constant = Model { rate: 0.0, keep: 0.0, noise: [self.constant_sd.powi(2), 0.0, 0.0] };
+    fn models(&self, interval: f32) -> [PixelModel; MODELS] {
+        let constant =
+            PixelModel { rate: 0.0, keep: 0.0, noise: [self.constant_sd.powi(2), 0.0, 0.0] };
         // M = S S' sigma_M^2 with S = [T^2 / 2, T]' (erratum: the square is missing).
         let (half, drift) = (interval * interval / 2.0, self.drift_sd.powi(2));
-        let drifting = Model {
+        let drifting = PixelModel {
             rate: interval,
             keep: 1.0,
             noise: [half * half * drift, half * interval * drift, interval * interval * drift],
@@ -64,7 +65,7 @@ impl ImmConfig {
             (1.0 + e * e - 2.0 * e) / (2.0 * k * k),
             (1.0 - e * e) / (2.0 * k),
         ];
-        let jumping = Model {
+        let jumping = PixelModel {
             rate: ((1.0 - e) / k) as f32,
             keep: e as f32,
             noise: noise.map(|m| (m * jump) as f32),
@@ -75,7 +76,7 @@ impl ImmConfig {
 
 /// The filters of eight pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Block {
+struct EightPixels {
     states: [[Lanes; PARTS]; MODELS],
     probabilities: [Lanes; MODELS],
 }
@@ -96,7 +97,7 @@ struct Block {
 #[derive(Clone, Debug, PartialEq)]
 pub struct PixelImm {
     config: ImmConfig,
-    blocks: Vec<Block>,
+    blocks: Vec<EightPixels>,
 }
 
 impl PixelImm {
@@ -108,7 +109,7 @@ impl PixelImm {
             let [variance, rate_variance] = [variance, 1.0].map(Lanes::splat);
             let state =
                 [Lanes(first), Lanes::splat(0.0), variance, Lanes::splat(0.0), rate_variance];
-            Block {
+            EightPixels {
                 states: [state; MODELS],
                 probabilities: [Lanes::splat(1.0 / MODELS as f32); MODELS],
             }
@@ -121,7 +122,7 @@ impl PixelImm {
     /// filters, the rest is left alone.
     pub fn step(&mut self, measured: &[f32], interval: f32, variance: f32, filtered: &mut [f32]) {
         let (models, stay) = (self.config.models(interval), self.config.stay);
-        Arch::new().dispatch(Step {
+        Arch::new().dispatch(PixelStep {
             blocks: &mut self.blocks,
             models,
             stay,
@@ -132,16 +133,16 @@ impl PixelImm {
     }
 }
 
-struct Step<'a> {
-    blocks: &'a mut [Block],
-    models: [Model; MODELS],
+struct PixelStep<'a> {
+    blocks: &'a mut [EightPixels],
+    models: [PixelModel; MODELS],
     stay: f32,
     measured: &'a [f32],
     variance: f32,
     filtered: &'a mut [f32],
 }
 
-impl WithSimd for Step<'_> {
+impl WithSimd for PixelStep<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -157,12 +158,12 @@ impl WithSimd for Step<'_> {
     }
 }
 
-impl Block {
+impl EightPixels {
     /// One step of eight pixels; returns their filtered brightness.
     #[inline(always)]
     fn step(
         &mut self,
-        models: &[Model; MODELS],
+        models: &[PixelModel; MODELS],
         stay: f32,
         measured: Lanes,
         variance: Lanes,
@@ -196,7 +197,7 @@ impl Block {
                 p22 = p22 + weights[m] * (states[m][4] + d1 * d1);
             }
             // (12): extrapolation, x = B x and P = B P B' + M.
-            let Model { rate: step, keep, noise } = models[l];
+            let PixelModel { rate: step, keep, noise } = models[l];
             let brightness = mixed + rate * step;
             let slope = rate * keep;
             let cross = p12 + p22 * step;

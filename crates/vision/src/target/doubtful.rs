@@ -3,10 +3,10 @@
 use super::Target;
 use crate::TrackerConfig;
 use crate::config::GateRule;
-use crate::frame::{Frame, Step};
+use crate::frame::{NewImage, TargetStep};
 use crate::gate::Region;
 use crate::hypotheses::DOUBT;
-use crate::motion::Motion;
+use crate::motion::ImageMotion;
 use crate::posterior::Posterior;
 use crate::scratch::Scratch;
 use crate::state::SEEN;
@@ -19,7 +19,7 @@ impl Target {
     /// Forks the hypotheses if the camera may have turned: then everything in its image has moved,
     /// the target too. But light that changes may be taken for a turn, so the target may have
     /// stayed as well.
-    pub(super) fn may_move_with_scene(&mut self, frame: Frame<'_>) {
+    pub(super) fn may_move_with_scene(&mut self, frame: NewImage<'_>) {
         let by = frame.scene_moved;
         let is_followed = !self.state.is_searching() && !self.identity.is_on_probation();
         if is_followed
@@ -43,10 +43,10 @@ impl Target {
     /// `scratch.ratios`.
     pub(super) fn follow_hypotheses(
         &mut self,
-        frame: Frame<'_>,
+        frame: NewImage<'_>,
         region: Region,
         scratch: &mut Scratch,
-    ) -> Step {
+    ) -> TargetStep {
         self.hypotheses.begin(&self.state);
         if let Some(one) = self.hypotheses.one_place(&self.state, frame, region, scratch) {
             return self.settle_on(one, frame, region, scratch);
@@ -55,7 +55,7 @@ impl Target {
         let Some(best) = self.hypotheses.best().cloned() else {
             self.hypotheses.clear();
             self.state.missed += 1;
-            return Step::unseen(0.0);
+            return TargetStep::unseen(0.0);
         };
         (self.state.motion, self.state.hidden) = (best.motion, best.hidden);
         self.hypotheses.note_doubt(frame.interval);
@@ -64,7 +64,7 @@ impl Target {
         let Some([column, row]) = best.peak else {
             self.state.missed += u32::from(is_unseen);
             self.settle(0.0);
-            return Step::unseen(0.0);
+            return TargetStep::unseen(0.0);
         };
         let sure = self.hypotheses.share_near([column, row], self.state.peak_half());
         let fit = self.state.fit_at(column, row, region.origin, scratch, frame.config);
@@ -79,7 +79,7 @@ impl Target {
         self.learn(frame, fit.place, fit, certainty, scratch);
         self.settle(best.weight);
         let measured = (certainty > SEEN).then(|| self.state.measurement(&fit));
-        Step { measured, score: fit.score, certainty, nis: None }
+        TargetStep { measured, score: fit.score, certainty, nis: None }
     }
 
     /// Forgets the other hypotheses if one place is left, or none.
@@ -93,11 +93,11 @@ impl Target {
     /// was.
     fn settle_on(
         &mut self,
-        (motion, posterior): (Motion, Posterior),
-        frame: Frame<'_>,
+        (motion, posterior): (ImageMotion, Posterior),
+        frame: NewImage<'_>,
         region: Region,
         scratch: &mut Scratch,
-    ) -> Step {
+    ) -> TargetStep {
         self.state.motion = motion;
         self.hypotheses.clear();
         let [column, row] = posterior.peak;

@@ -3,25 +3,29 @@
 use crossfix_filter::AxisMeasurement;
 
 use super::{MANOEUVRE, Target};
-use crate::frame::{Frame, Step};
+use crate::frame::{NewImage, TargetStep};
 use crate::scratch::Scratch;
 use crate::search::Sought;
 
 impl Target {
-    pub(super) fn search(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
+    pub(super) fn search(&mut self, frame: NewImage<'_>, scratch: &mut Scratch) -> TargetStep {
         self.state.forget_contrast(frame.interval);
         if !frame.may_search {
             self.state.missed += 1;
-            return Step::unseen(0.0);
+            return TargetStep::unseen(0.0);
         }
         self.find_again(frame, scratch).unwrap_or_else(|score| {
             self.state.missed += 1;
-            Step::unseen(score)
+            TargetStep::unseen(score)
         })
     }
 
     /// Takes what a search finds, if it is accepted; else returns its score.
-    fn find_again(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Result<Step, f64> {
+    fn find_again(
+        &mut self,
+        frame: NewImage<'_>,
+        scratch: &mut Scratch,
+    ) -> Result<TargetStep, f64> {
         let Self { state, identity, search_memory: memory, .. } = self;
         let found = Sought { state, identity, memory }.find(frame, scratch);
         let Some(fit) = found.fit.filter(|_| found.accepted) else {
@@ -43,12 +47,16 @@ impl Target {
         self.seen(fit.place);
         self.hypotheses.clear();
         let measured = self.state.measurement(&fit);
-        Ok(Step { measured: Some(measured), score: fit.score, certainty: 1.0, nis: None })
+        Ok(TargetStep { measured: Some(measured), score: fit.score, certainty: 1.0, nis: None })
     }
 
     /// Follows what a search has found. If that is lost again soon it was something else, and the
     /// search goes on from what was known before.
-    pub(super) fn follow_on_probation(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
+    pub(super) fn follow_on_probation(
+        &mut self,
+        frame: NewImage<'_>,
+        scratch: &mut Scratch,
+    ) -> TargetStep {
         self.identity.predict_probation(frame);
         let step = self.follow(frame, scratch);
         if self.state.is_searching() && self.identity.fail_probation(&mut self.state) {

@@ -15,15 +15,15 @@ use nalgebra::Matrix2;
 
 use crate::config::GateRule;
 use crate::fit::TargetFit;
-use crate::frame::{Frame, Measurement, Step};
+use crate::frame::{Measurement, NewImage, TargetStep};
 use crate::gate::Region;
-use crate::hypotheses::Hypotheses;
+use crate::hypotheses::PlaceHypotheses;
 use crate::identity::Identity;
-use crate::motion::Evidence;
-use crate::posterior::{Part, Posterior};
+use crate::motion::PlaceEvidence;
+use crate::posterior::{Posterior, PosteriorPart};
 use crate::scratch::Scratch;
 use crate::search_memory::SearchMemory;
-use crate::state::{SEEN, State};
+use crate::state::{BeliefState, SEEN};
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Variance below which a fit is narrower than the map's pixels, px^2.
@@ -43,9 +43,9 @@ const SURE: f64 = 0.99;
 /// A target under track.
 #[derive(Clone, Debug)]
 pub(crate) struct Target {
-    pub(crate) state: State,
+    pub(crate) state: BeliefState,
     pub(crate) identity: Identity,
-    pub(crate) hypotheses: Hypotheses,
+    pub(crate) hypotheses: PlaceHypotheses,
     pub(crate) search_memory: SearchMemory,
 }
 
@@ -77,9 +77,9 @@ impl Target {
         config: &TrackerConfig,
     ) -> Self {
         Self {
-            state: State::new(image, place, scratch, config),
+            state: BeliefState::new(image, place, scratch, config),
             identity: Identity::new(),
-            hypotheses: Hypotheses::default(),
+            hypotheses: PlaceHypotheses::default(),
             search_memory: SearchMemory::default(),
         }
     }
@@ -102,7 +102,7 @@ impl Target {
     }
 
     /// Follows the target into the next image.
-    pub(crate) fn step(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
+    pub(crate) fn step(&mut self, frame: NewImage<'_>, scratch: &mut Scratch) -> TargetStep {
         self.may_move_with_scene(frame);
         self.identity.note_last_place(&self.state, frame);
         self.state.predict(frame);
@@ -120,11 +120,11 @@ impl Target {
     /// the box it starts the motion from two measurements (Herasymenko 2021, eqs. 13-14).
     pub(crate) fn take_place(
         &mut self,
-        frame: Frame<'_>,
+        frame: NewImage<'_>,
         place: ImagePoint,
         scratch: &mut Scratch,
-    ) -> Step {
-        let Frame { image, interval, config, .. } = frame;
+    ) -> TargetStep {
+        let NewImage { image, interval, config, .. } = frame;
         let variance = config.given_sd_px.powi(2);
         let searching = self.state.is_searching();
         let given = [place.x, place.y].map(|position| AxisMeasurement { position, variance });
@@ -150,11 +150,11 @@ impl Target {
         self.hypotheses.clear();
         let covariance = Matrix2::identity() * variance;
         let measured = Measurement { place, covariance };
-        Step { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
+        TargetStep { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
     }
 
-    fn follow(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
-        let Frame { image, config, .. } = frame;
+    fn follow(&mut self, frame: NewImage<'_>, scratch: &mut Scratch) -> TargetStep {
+        let NewImage { image, config, .. } = frame;
         let reach = self.hypotheses.reach(self.state.position());
         let half = self.state.half_gate(image, config);
         let image_sides = [image.width(), image.height()];
@@ -192,12 +192,12 @@ impl Target {
     /// Takes the posterior into the filters and the target's image into the reference.
     fn update(
         &mut self,
-        frame: Frame<'_>,
+        frame: NewImage<'_>,
         posterior: &Posterior,
         fit: TargetFit,
         origin: [f64; 2],
         scratch: &mut Scratch,
-    ) -> Step {
+    ) -> TargetStep {
         let is_there = self.identity.doubt(&self.state, frame, fit, scratch);
         let doubted = posterior.doubted(is_there);
         let certainty = doubted.near.mass;
@@ -207,7 +207,8 @@ impl Target {
         }
         let expected = self.state.motion.found();
         let distance = self.state.motion.nis(found);
-        let step = |measured| Step { measured, score: fit.score, certainty, nis: Some(distance) };
+        let step =
+            |measured| TargetStep { measured, score: fit.score, certainty, nis: Some(distance) };
         let measured = self.state.measurement(&fit);
         if let GateRule::Ellipsoid { probability } = frame.config.gate
             && !Gate::with_probability(probability).holds(distance)
@@ -221,7 +222,7 @@ impl Target {
                 (found[i].position - expected[i].position).powi(2) / expected[i].variance
             };
             self.state.motion.inflate((off(0).max(off(1)) / MANOEUVRE).clamp(1.0, MOST_INFLATED));
-            self.state.motion.update(&Evidence::of(found));
+            self.state.motion.update(&PlaceEvidence::of(found));
             self.seen(fit.place);
             self.learn(frame, fit.place, fit, certainty, scratch);
             return step(Some(measured));
@@ -251,7 +252,7 @@ impl Target {
         fitted: [AxisMeasurement; 2],
         origin: [f64; 2],
         config: &TrackerConfig,
-    ) -> Evidence {
+    ) -> PlaceEvidence {
         let narrow = fitted.iter().all(|at| at.variance < NARROW);
         let floor = config.prediction_floor_px.powi(2);
         let expected = self
@@ -259,7 +260,7 @@ impl Target {
             .motion
             .found()
             .map(|at| AxisMeasurement { variance: at.variance + floor, ..at });
-        let in_image = |part: &Part, i: usize| AxisMeasurement {
+        let in_image = |part: &PosteriorPart, i: usize| AxisMeasurement {
             position: origin[i] + part.mean[i],
             variance: part.variance[i],
         };
@@ -268,7 +269,7 @@ impl Target {
         } else {
             [0, 1].map(|i| without_prior(in_image(&posterior.near, i), expected[i]))
         };
-        Evidence {
+        PlaceEvidence {
             near: posterior.near.mass,
             at,
             elsewhere: posterior.elsewhere.mass,
@@ -289,7 +290,7 @@ impl Target {
     /// From one on probation nothing is learnt.
     fn learn(
         &mut self,
-        frame: Frame<'_>,
+        frame: NewImage<'_>,
         place: ImagePoint,
         fit: TargetFit,
         certainty: f64,

@@ -23,7 +23,7 @@ const ANOTHER_COUNT_S: f64 = 2.0;
 const SHORTEST_S: f64 = 1e-3;
 
 /// Follows targets in a stream.
-pub(super) struct Watch {
+pub(super) struct StreamFollower {
     pub(super) file: CameraFile,
     begins: Timestamp,
     pub(super) tracker: ImageTracker,
@@ -33,7 +33,7 @@ pub(super) struct Watch {
     shown: Option<Timestamp>,
 }
 
-impl Watch {
+impl StreamFollower {
     /// A frame's time for the tracker: advanced by the stream's own time, or by arrival where the
     /// stream has started a new count.
     fn even_time(&mut self, live: Arrival) -> Timestamp {
@@ -62,7 +62,8 @@ impl Agent {
         for place in file.boxes() {
             tracker.take_up(place);
         }
-        let mut watch = Watch { file: file.clone(), begins, tracker, tracked: None, shown: None };
+        let mut watch =
+            StreamFollower { file: file.clone(), begins, tracker, tracked: None, shown: None };
         let heeds_reports = file.clock_source() != ClockSource::Arrival;
         self.stream = Some(StreamHealth::new(heeds_reports));
         let live = Live::start(move |silence| camera.open(silence));
@@ -104,7 +105,7 @@ impl Agent {
     }
 
     /// Follows targets in one frame and publishes their bearings.
-    fn follow(&mut self, watch: &mut Watch, frame: &Frame) -> anyhow::Result<()> {
+    fn follow(&mut self, watch: &mut StreamFollower, frame: &Frame) -> anyhow::Result<()> {
         if let Err(error) = self.check_size(frame) {
             // The right size may come back, and the other cameras still work, so this does not end
             // the agent.

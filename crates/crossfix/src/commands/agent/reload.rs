@@ -4,7 +4,7 @@ use crossfix_message::{ClockSource, Payload, Timestamp};
 use crossfix_vision::ImageTracker;
 
 use super::Agent;
-use super::live::Watch;
+use super::live::StreamFollower;
 use crate::config::CameraFile;
 use crate::pace::wall_seconds;
 
@@ -56,7 +56,7 @@ impl Again {
 impl Agent {
     /// Reads the camera's file again: pose, lens, clock, preview and the tracker's parameters take
     /// effect at once. A file with an error changes nothing.
-    pub(super) fn reload(&mut self, watch: &mut Watch) -> anyhow::Result<()> {
+    pub(super) fn reload(&mut self, watch: &mut StreamFollower) -> anyhow::Result<()> {
         let name = self.identity.name.clone();
         match self.read_again(watch) {
             Ok(waits) if waits.is_empty() => {
@@ -81,7 +81,7 @@ impl Agent {
     }
 
     /// Applies the changes that can take effect at once; returns the keys that cannot.
-    fn read_again(&mut self, watch: &mut Watch) -> anyhow::Result<Vec<&'static str>> {
+    fn read_again(&mut self, watch: &mut StreamFollower) -> anyhow::Result<Vec<&'static str>> {
         let Again { file, waits } =
             Again::of(CameraFile::load(&self.config, &self.sets)?, &watch.file)?;
         let camera = file.camera(&self.config)?;

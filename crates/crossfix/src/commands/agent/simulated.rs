@@ -80,7 +80,7 @@ struct SimulatedSource {
 impl SimulatedSource {
     /// A camera's view of a scene that begins `start` seconds after the Unix epoch.
     fn open(path: &Path, file: &CameraFile, start: f64) -> anyhow::Result<Self> {
-        let scene: Scene = config::load(path, &[], config::Kind::Scene)?;
+        let scene: Scene = config::load(path, &[], config::FileKind::Scene)?;
         let world =
             scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
         let camera = world

@@ -69,7 +69,7 @@ impl Start {
 
 /// What the site plays, by the fusion centre's health.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Site {
+enum PlayedScene {
     /// The site's time runs and is `now`; if it plays a scene, the scene began at `scene_begins`.
     Plays { now: Timestamp, scene_begins: Timestamp },
     /// The site's time stands still, and all cameras are present.
@@ -78,16 +78,16 @@ enum Site {
     Waits,
 }
 
-fn judge(health: &Health, cameras: &[CameraName]) -> Site {
+fn judge(health: &Health, cameras: &[CameraName]) -> PlayedScene {
     if health.is_playing {
-        return Site::Plays {
+        return PlayedScene::Plays {
             now: Timestamp::from_nanos(health.time_ns),
             scene_begins: Timestamp::from_nanos(health.scene_begins_ns),
         };
     }
     let is_present =
         |camera: &CameraName| health.present.iter().any(|name| name == camera.as_str());
-    if cameras.iter().all(is_present) { Site::IsComplete } else { Site::Waits }
+    if cameras.iter().all(is_present) { PlayedScene::IsComplete } else { PlayedScene::Waits }
 }
 
 impl Agent {
@@ -171,11 +171,11 @@ impl Agent {
             let Ok(health) = decode::<Health>(&received.data) else { continue };
             let area = received.key.area;
             match judge(&health, &network.cameras_of(area.as_ref())?) {
-                Site::Plays { now, scene_begins } => {
+                PlayedScene::Plays { now, scene_begins } => {
                     return Ok(Some(self.join(file, begins, now, scene_begins)));
                 }
-                Site::IsComplete => drop(complete.insert(area)),
-                Site::Waits => drop(complete.remove(&area)),
+                PlayedScene::IsComplete => drop(complete.insert(area)),
+                PlayedScene::Waits => drop(complete.remove(&area)),
             }
             if areas.iter().all(|area| complete.contains(area)) {
                 return Ok(Some(Start::together()));
@@ -223,10 +223,10 @@ mod tests {
             is_playing,
             ..Default::default()
         };
-        assert_eq!(judge(&health(false, &["a"]), &cameras), Site::Waits);
+        assert_eq!(judge(&health(false, &["a"]), &cameras), PlayedScene::Waits);
         // A file may have been played to its end before.
-        assert_eq!(judge(&health(false, &["b", "a"]), &cameras), Site::IsComplete);
+        assert_eq!(judge(&health(false, &["b", "a"]), &cameras), PlayedScene::IsComplete);
         let plays = judge(&health(true, &["b", "a"]), &cameras);
-        assert!(matches!(plays, Site::Plays { now, .. } if now == at));
+        assert!(matches!(plays, PlayedScene::Plays { now, .. } if now == at));
     }
 }

@@ -48,7 +48,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let fusion = args.config.as_deref().map(|path| path.join(FUSION)).filter(|file| file.is_file());
     let recalibration = calibration.as_deref().map(Recalibration::load).transpose()?;
     let seen = watched(&args.recording, recalibration, fusion.as_deref())?;
-    let figures: Vec<Figures> = seen.iter().map(|(name, seen)| Figures::of(name, seen)).collect();
+    let figures: Vec<CheckedCamera> =
+        seen.iter().map(|(name, seen)| CheckedCamera::of(name, seen)).collect();
     if args.json {
         output::json(&figures)?;
     } else {
@@ -56,12 +57,12 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     let wrong: Vec<&str> = figures
         .iter()
-        .filter(|camera| matches!(camera.verdict, Verdict::Moved | Verdict::Apart))
+        .filter(|camera| matches!(camera.verdict, CameraVerdict::Moved | CameraVerdict::Apart))
         .map(|camera| camera.name.as_str())
         .collect();
     ensure!(wrong.is_empty(), "not as calibrated: {}", wrong.join(", "));
     ensure!(
-        figures.iter().any(|camera| camera.verdict == Verdict::Fits),
+        figures.iter().any(|camera| camera.verdict == CameraVerdict::Fits),
         "nothing is checked: no target was seen by three cameras for long enough"
     );
     Ok(())
@@ -87,7 +88,7 @@ const LEFT_OUT: f64 = 0.2;
 
 /// What a recording shows of one camera.
 #[derive(Debug, Default)]
-struct Seen {
+struct CameraRecord {
     frames: u64,
     /// Since when it has been left out, if it is, ...
     left_out_since: Option<Timestamp>,
@@ -99,7 +100,7 @@ struct Seen {
     has_moved: bool,
 }
 
-impl Seen {
+impl CameraRecord {
     fn see_frame(&mut self, time: Timestamp) {
         self.frames += 1;
         let first = self.span.map_or(time, |(first, _)| first);
@@ -149,14 +150,14 @@ fn watched(
     recording: &Path,
     recalibration: Option<Recalibration>,
     fusion: Option<&Path>,
-) -> anyhow::Result<BTreeMap<CameraName, Seen>> {
+) -> anyhow::Result<BTreeMap<CameraName, CameraRecord>> {
     let mut centre = Centre::new(FusionFile::load(fusion, &[])?.fusion(), None)?;
     for entry in calibrations(recording, recalibration.is_some())? {
         let entry =
             recalibration.as_ref().map_or_else(|| entry.clone(), |new| new.applied(entry.clone()));
         centre.take(&entry.key.channel, &entry.data, "");
     }
-    let mut seen: BTreeMap<CameraName, Seen> = BTreeMap::new();
+    let mut seen: BTreeMap<CameraName, CameraRecord> = BTreeMap::new();
     let mut take = |entry: Entry| {
         match &entry.key.channel {
             Channel::Bearings(name) => {
@@ -195,7 +196,7 @@ fn watched(
 /// Verdict on a camera.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-enum Verdict {
+enum CameraVerdict {
     Fits,
     Moved,
     Apart,
@@ -203,9 +204,9 @@ enum Verdict {
 }
 
 #[derive(Debug, Serialize)]
-struct Figures {
+struct CheckedCamera {
     name: String,
-    verdict: Verdict,
+    verdict: CameraVerdict,
     /// The longest time that it was watched together with others within about a minute, s.
     watched_s: f64,
     /// Estimated turn when the evidence for a move was strongest, mrad.
@@ -218,29 +219,29 @@ struct Figures {
     why: String,
 }
 
-impl Figures {
-    fn of(name: &CameraName, seen: &Seen) -> Self {
+impl CheckedCamera {
+    fn of(name: &CameraName, seen: &CameraRecord) -> Self {
         let watched_s = seen.watch.as_ref().map_or(0.0, |watch| watch.watched_s);
         let moved_at =
             seen.watch.as_ref().and_then(|watch| watch.moved_at).filter(|_| seen.has_moved);
         let (verdict, why) = match &seen.watch {
             Some(watch) if let Some(at) = watch.moved_at.filter(|_| seen.has_moved) => {
-                (Verdict::Moved, format!("{}, sure at {at}: calibrate it anew", Turn(&watch.worst)))
+                (CameraVerdict::Moved, format!("{}, sure at {at}: calibrate it anew", Turn(&watch.worst)))
             }
             _ if seen.is_apart() => (
-                Verdict::Apart,
+                CameraVerdict::Apart,
                 "its bearings lie far beside what the others see: its pose, its clock or its name is \
                  wrong"
                     .to_owned(),
             ),
             Some(watch) if watch.watched_s >= LEAST_WATCHED_S => (
-                Verdict::Fits,
+                CameraVerdict::Fits,
                 watch.moved_at.map_or_else(String::new, |at| {
                     format!("at {at} it might have been moved in the place of another, which was")
                 }),
             ),
             _ => (
-                Verdict::Unchecked,
+                CameraVerdict::Unchecked,
                 format!("too few targets that two others see, in {} frames", seen.frames),
             ),
         };
@@ -258,16 +259,16 @@ impl Figures {
     }
 }
 
-fn render(figures: &[Figures]) -> String {
+fn render(figures: &[CheckedCamera]) -> String {
     let head = ["camera", "watched [s]", "turned by [mrad]", "SD [mrad]", "evidence", "verdict"];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     for camera in figures {
         let verdict = match camera.verdict {
-            Verdict::Fits if camera.why.is_empty() => "fits",
-            Verdict::Fits => "fits: ",
-            Verdict::Moved => "MOVED: ",
-            Verdict::Apart => "APART: ",
-            Verdict::Unchecked => "unchecked: ",
+            CameraVerdict::Fits if camera.why.is_empty() => "fits",
+            CameraVerdict::Fits => "fits: ",
+            CameraVerdict::Moved => "MOVED: ",
+            CameraVerdict::Apart => "APART: ",
+            CameraVerdict::Unchecked => "unchecked: ",
         };
         rows.push(vec![
             camera.name.clone(),

@@ -19,7 +19,7 @@ const DIRECTION_SD_DEG: f64 = 0.01;
 /// A row of the landmarks file.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Row {
+struct LandmarkRow {
     camera: Option<CameraName>,
     landmark: String,
     x_px: f64,
@@ -53,7 +53,7 @@ pub fn read(
         csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).with_context(wrong)?;
     let frame = anchor.map(LocalFrame::at);
     let mut cameras: BTreeMap<CameraName, Vec<Landmark>> = BTreeMap::new();
-    for (index, record) in reader.deserialize::<Row>().enumerate() {
+    for (index, record) in reader.deserialize::<LandmarkRow>().enumerate() {
         let place = || format!("the landmarks {}, row {}", path.display(), index + 2);
         let row = record.with_context(wrong)?;
         let own = row.camera.clone().or_else(|| camera.cloned()).with_context(|| {
@@ -124,7 +124,7 @@ pub fn check(landmarks: &[Landmark], size: ImageSize) -> anyhow::Result<()> {
     Ok(())
 }
 
-impl Row {
+impl LandmarkRow {
     fn landmark(&self, frame: Option<&LocalFrame>) -> anyhow::Result<Landmark> {
         let click_sd_px = self.sd_px.unwrap_or(CLICK_SD_PX);
         ensure!(

@@ -109,7 +109,7 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let log = args.log.as_deref().map(|path| log::read(path, &args.reading())).transpose()?;
     let prior = args.prior.as_deref().map(calibrated::load).transpose()?;
-    let Seen { mut cameras, is_corrected } =
+    let RecordedLabels { mut cameras, is_corrected } =
         seen(&args.recording, args.lens.into(), prior.as_ref())?;
     ensure!(
         args.hold_out.is_none() || !is_corrected,
@@ -304,7 +304,7 @@ fn cut(
 }
 
 /// Labels from a recording.
-struct Seen {
+struct RecordedLabels {
     cameras: Vec<CameraLabels>,
     /// Whether its times are common times, corrected by a calibration.
     is_corrected: bool,
@@ -316,7 +316,7 @@ fn seen(
     recording: &Path,
     freedom: LensFreedom,
     prior: Option<&SiteCalibration>,
-) -> anyhow::Result<Seen> {
+) -> anyhow::Result<RecordedLabels> {
     let known = |name: &CameraName| prior.and_then(|site| site.camera(name));
     let described = described(recording)?;
     for name in described.iter().filter(|(_, camera)| camera.is_on_mount).map(|(name, _)| name) {
@@ -365,7 +365,10 @@ fn seen(
         cameras.push(CameraLabels { name, intrinsics, freedom, labels });
     }
     ensure!(!cameras.is_empty(), "{} holds no camera's bearings", recording.display());
-    Ok(Seen { cameras, is_corrected: described.values().any(|camera| camera.is_corrected) })
+    Ok(RecordedLabels {
+        cameras,
+        is_corrected: described.values().any(|camera| camera.is_corrected),
+    })
 }
 
 /// A recording's description of one camera.

@@ -97,7 +97,7 @@ impl HeldOut {
         site: SiteCalibration,
         log: Option<&FlightLog>,
     ) -> anyhow::Result<Worth> {
-        let mut run = Run::empty()?;
+        let mut run = HeldOutRun::empty()?;
         let mut calibrations = BTreeMap::new();
         let mut lacks = Lacks::default();
         recorded::for_each(recording, &mut lacks, |_, entry| {
@@ -136,7 +136,7 @@ impl HeldOut {
 }
 
 /// State and results of the fusion.
-struct Run {
+struct HeldOutRun {
     centre: Centre,
     history: TrackHistory,
     sightings: Sightings,
@@ -144,7 +144,7 @@ struct Run {
     innovations: BTreeMap<String, (f64, u32)>,
 }
 
-impl Run {
+impl HeldOutRun {
     fn empty() -> anyhow::Result<Self> {
         Ok(Self {
             centre: Centre::new(FusionConfig::default(), None)?,

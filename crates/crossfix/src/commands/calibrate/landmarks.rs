@@ -95,7 +95,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for error in &failed {
         tracing::warn!("{error}");
     }
-    let figures: Vec<Figures> = results.iter().map(Figures::from).collect();
+    let figures: Vec<PosedCamera> = results.iter().map(PosedCamera::from).collect();
     if args.json {
         output::json(&figures)?;
     } else {
@@ -160,7 +160,7 @@ fn write(args: &Args, cameras: &[&LandmarkResult]) -> anyhow::Result<()> {
 
 /// The figures of one camera.
 #[derive(Debug, Serialize)]
-struct Figures {
+struct PosedCamera {
     name: String,
     position_m: [f64; 3],
     position_sd_m: f64,
@@ -173,12 +173,12 @@ struct Figures {
     focal_ratio: f64,
     /// Probability of errors at least as large as these.
     chance: f64,
-    landmarks: Vec<LandmarkFigures>,
+    landmarks: Vec<ClickedLandmark>,
     verdict: String,
 }
 
 #[derive(Debug, Serialize)]
-struct LandmarkFigures {
+struct ClickedLandmark {
     landmark: String,
     /// Clicked pixel minus predicted pixel.
     residual_px: [f64; 2],
@@ -242,10 +242,10 @@ fn verdict(result: &LandmarkResult) -> String {
     "good".to_owned()
 }
 
-impl From<&LandmarkResult> for Figures {
+impl From<&LandmarkResult> for PosedCamera {
     fn from(result: &LandmarkResult) -> Self {
         let over_image = result.over_image();
-        let landmarks = result.landmarks.iter().map(|fit| LandmarkFigures {
+        let landmarks = result.landmarks.iter().map(|fit| ClickedLandmark {
             landmark: fit.name.clone(),
             residual_px: fit.residual_px.into(),
             deviations: fit.deviations,
@@ -265,7 +265,7 @@ impl From<&LandmarkResult> for Figures {
     }
 }
 
-impl Figures {
+impl PosedCamera {
     fn render(&self) -> String {
         let mut rows = vec![["landmark", "beside [px]", "deviations"].map(str::to_owned).to_vec()];
         for landmark in &self.landmarks {

@@ -25,11 +25,11 @@ use crossfix_calibration::LensFreedom;
 )]
 pub struct Args {
     #[command(subcommand)]
-    way: Way,
+    way: CalibrateCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Way {
+enum CalibrateCommand {
     Flight(Box<flight::Args>),
     Landmarks(landmarks::Args),
     Compare(compare::Args),
@@ -60,9 +60,9 @@ impl From<Lens> for LensFreedom {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     match &args.way {
-        Way::Flight(args) => flight::run(args),
-        Way::Landmarks(args) => landmarks::run(args),
-        Way::Compare(args) => compare::run(args),
-        Way::Check(args) => check::run(args),
+        CalibrateCommand::Flight(args) => flight::run(args),
+        CalibrateCommand::Landmarks(args) => landmarks::run(args),
+        CalibrateCommand::Compare(args) => compare::run(args),
+        CalibrateCommand::Check(args) => check::run(args),
     }
 }

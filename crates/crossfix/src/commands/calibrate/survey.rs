@@ -38,7 +38,7 @@ impl FromStr for Distance {
 
 /// A row of the survey.
 #[derive(Debug, Deserialize)]
-struct Row {
+struct SurveyRow {
     camera: CameraName,
     east_m: f64,
     north_m: f64,
@@ -51,7 +51,7 @@ struct Row {
     sd_up_m: Option<f64>,
 }
 
-impl Row {
+impl SurveyRow {
     fn place(&self) -> Option<SurveyedPlace> {
         let sd = [self.sd_east_m, self.sd_north_m, self.sd_up_m].map(|sd| sd.or(self.sd_m));
         let [Some(east), Some(north), Some(up)] = sd else { return None };
@@ -95,7 +95,7 @@ fn read_places(path: &Path) -> anyhow::Result<Vec<SurveyedPlace>> {
     let mut reader =
         csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).with_context(wrong)?;
     let mut places: Vec<SurveyedPlace> = Vec::new();
-    for (row, record) in reader.deserialize::<Row>().enumerate() {
+    for (row, record) in reader.deserialize::<SurveyRow>().enumerate() {
         let place = record.with_context(wrong)?.place().with_context(|| {
             format!(
                 "the survey {}, row {}: camera, east_m, north_m, up_m and sd_m (or sd_east_m, \

@@ -20,7 +20,7 @@ const OLD_S: f64 = 3600.0;
 
 /// What `chronyc -c tracking` says.
 #[derive(Clone, Debug, PartialEq)]
-struct Tracking {
+struct ChronyTracking {
     server: String,
     /// When the clock was last compared, s since the Unix epoch.
     compared_s: f64,
@@ -29,7 +29,7 @@ struct Tracking {
     is_synchronised: bool,
 }
 
-impl Tracking {
+impl ChronyTracking {
     /// Parses the fourteen comma-separated values; `None` if they are not as expected.
     fn parse(line: &str) -> Option<Self> {
         let fields: Vec<&str> = line.trim().split(',').collect();
@@ -125,10 +125,10 @@ fn said(program: &str, arguments: &[&str]) -> Option<String> {
 /// Accuracy of this host's clock: by the program that disciplines it, or by what that has told the
 /// kernel.
 pub fn host_clock() -> Finding {
-    let chrony = || Tracking::parse(&said("chronyc", &["-c", "tracking"])?);
+    let chrony = || ChronyTracking::parse(&said("chronyc", &["-c", "tracking"])?);
     let ptp = || Ptp::parse(&said("pmc", &["-u", "-b", "0", "GET TIME_STATUS_NP"])?);
     let (chrony, kernel) = (chrony(), kernel_clock_bound());
-    let keeps = |tracking: &&Tracking| tracking.is_synchronised || kernel.is_none();
+    let keeps = |tracking: &&ChronyTracking| tracking.is_synchronised || kernel.is_none();
     let (verdict, found) = if let Some(tracking) = chrony.as_ref().filter(keeps) {
         tracking.judge(wall_seconds())
     // ptp4l disciplines a network card's clock; it is this host's only if the kernel was told of
@@ -155,7 +155,7 @@ mod tests {
         let line = format!(
             "7F7F0101,10.0.0.1,3,1795000000.0,{offset},0.000001,0.00001,-1.2,0.0,0.1,{delay},{dispersion},64.5,{leap}\n"
         );
-        Tracking::parse(&line).unwrap().judge(NOW_S).0
+        ChronyTracking::parse(&line).unwrap().judge(NOW_S).0
     }
 
     #[test]
@@ -189,7 +189,7 @@ mod tests {
     #[test]
     fn what_is_no_answer_is_none() {
         for line in ["", "506 Cannot talk to daemon", "1,2,3", "a,b,c,d,e,f,g,h,i,j,k,l,m,n"] {
-            assert_eq!(Tracking::parse(line), None);
+            assert_eq!(ChronyTracking::parse(line), None);
         }
     }
 }

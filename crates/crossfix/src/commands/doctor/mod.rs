@@ -15,7 +15,7 @@ use crossfix_video::decoding_time;
 use serde::Serialize;
 
 use super::sources::{Tried, try_out};
-use crate::config::{self, CameraFile, Kind, OnvifConfig, load_network};
+use crate::config::{self, CameraFile, FileKind, OnvifConfig, load_network};
 #[cfg(feature = "onvif")]
 use crate::onvif;
 use crate::output;
@@ -90,11 +90,11 @@ impl Finding {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let keys: toml::Table = config::load(&args.config, &[], Kind::Camera)?;
-    let findings = match Kind::of(&keys) {
-        Some(Kind::Camera) => of_camera(&args.config)?,
-        Some(Kind::Network) => of_network(&load_network(&args.config)?, &Identity::Viewer),
-        Some(Kind::Fusion) => {
+    let keys: toml::Table = config::load(&args.config, &[], FileKind::Camera)?;
+    let findings = match FileKind::of(&keys) {
+        Some(FileKind::Camera) => of_camera(&args.config)?,
+        Some(FileKind::Network) => of_network(&load_network(&args.config)?, &Identity::Viewer),
+        Some(FileKind::Fusion) => {
             let network = keys.get("network").and_then(toml::Value::as_str);
             let network = network
                 .with_context(|| format!("{}: key `network` is missing", args.config.display()))?;
@@ -161,7 +161,7 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     });
     let identity = Identity::Camera(file.name);
     findings.extend(security::of_own(&network, &identity));
-    let others = security::Others::seen_by(&network, &identity);
+    let others = security::OtherComponents::seen_by(&network, &identity);
     findings.extend(routers(&network, &others));
     Ok(findings)
 }
@@ -303,7 +303,7 @@ fn of_own_endpoint(endpoint: &str) -> Finding {
 /// Which components of the network can be reached by one of them.
 fn of_network(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
     let mut findings = security::of_own(network, identity);
-    let others = security::Others::seen_by(network, identity);
+    let others = security::OtherComponents::seen_by(network, identity);
     // In a network with a router only the router listens.
     if network.mode == Mode::Peer {
         // An area's fusion centre connects only to its own cameras.
@@ -329,7 +329,7 @@ fn of_network(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
 }
 
 /// Which of the network's routers can be reached.
-fn routers(network: &NetworkConfig, others: &security::Others<'_>) -> Vec<Finding> {
+fn routers(network: &NetworkConfig, others: &security::OtherComponents<'_>) -> Vec<Finding> {
     let routers = network.routers.iter();
     routers.map(|router| others.of("router", router, &Identity::Router)).collect()
 }

@@ -64,13 +64,13 @@ fn of_key(path: &Path) -> Option<Finding> {
 }
 
 /// The other components, as seen from one of them.
-pub struct Others<'a> {
+pub struct OtherComponents<'a> {
     network: &'a NetworkConfig,
     /// Credentials presented to the others; `None` where none are used, or none can be loaded.
     shown: Option<Credentials>,
 }
 
-impl<'a> Others<'a> {
+impl<'a> OtherComponents<'a> {
     pub fn seen_by(network: &'a NetworkConfig, identity: &Identity) -> Self {
         let security = network.security.as_ref();
         let shown = security

@@ -6,7 +6,7 @@ use anyhow::{Context, ensure};
 use crossfix_evaluation::Report;
 use serde::Serialize;
 
-use super::{Evaluation, Question, Run, evaluate};
+use super::{EvaluatedRun, Evaluation, Question, evaluate};
 use crate::output;
 
 /// The results of two runs.
@@ -81,12 +81,12 @@ pub fn draw(a: &Path, b: &Path, question: &Question, path: &Path) -> anyhow::Res
     use crossfix_message::Timestamp;
     use crossfix_view::{ComparedRun, ComparisonPicture, PlaceInTime};
 
-    let (mut first, mut second) = (Run::default(), Run::default());
+    let (mut first, mut second) = (EvaluatedRun::default(), EvaluatedRun::default());
     first.read(a, question.smoothed)?;
     second.read(b, question.smoothed)?;
     let truth = match &question.truth {
         Some(path) => {
-            let mut other = Run::default();
+            let mut other = EvaluatedRun::default();
             other.read(path, question.smoothed)?;
             other.truth
         }
@@ -106,7 +106,7 @@ pub fn draw(a: &Path, b: &Path, question: &Question, path: &Path) -> anyhow::Res
     places.sort_by_key(|at| (at.time, at.id));
     let mut times: Vec<Timestamp> = places.iter().map(|at| at.time).collect();
     times.dedup();
-    let compared = |run: &Run, path: &Path| {
+    let compared = |run: &EvaluatedRun, path: &Path| {
         let at = |&time: &Timestamp| {
             run.estimates(time, 0.0).into_iter().map(move |estimate| PlaceInTime {
                 time,

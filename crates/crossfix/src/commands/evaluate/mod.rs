@@ -89,7 +89,7 @@ pub struct Evaluation {
 
 /// What is read from a recording for its evaluation.
 #[derive(Default)]
-struct Run {
+struct EvaluatedRun {
     truth: Vec<TruthFrame>,
     tracks: TrackHistory,
     track_frames: u64,
@@ -99,7 +99,7 @@ struct Run {
     datum: Option<Datum>,
 }
 
-impl Run {
+impl EvaluatedRun {
     /// The tracks at a time. The truth comes from elsewhere, so its own error and the error of the
     /// site as a whole are added to the tracks' covariances.
     fn estimates(&self, time: Timestamp, truth_sd_m: f64) -> Vec<Estimate> {
@@ -162,11 +162,11 @@ fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
 
 /// Evaluates a recording.
 pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluation> {
-    let mut run = Run::default();
+    let mut run = EvaluatedRun::default();
     let mut lacks = run.read(recording, question.smoothed)?;
     lacks.ensure_found(run.track_frames > 0, "tracks", recording)?;
     if let Some(path) = &question.truth {
-        let mut other = Run::default();
+        let mut other = EvaluatedRun::default();
         let theirs = other.read(path, question.smoothed)?;
         theirs.ensure_found(!other.truth.is_empty(), "truth", path)?;
         run.truth = other.truth;

@@ -7,7 +7,7 @@ use crossfix_evaluation::{Estimate, TrackHistory};
 use crossfix_message::{Channel, Timestamp, TrackFrame, TrackState};
 use serde::Deserialize;
 
-use self::others::Others;
+use self::others::OtherFormats;
 use crate::output::{self, Draft};
 use crate::recorded::{self, Lacks};
 
@@ -42,7 +42,7 @@ pub struct Args {
     #[arg(long)]
     smoothed: bool,
     #[command(flatten)]
-    others: Others,
+    others: OtherFormats,
 }
 
 /// A track's state in one word.

@@ -19,7 +19,7 @@ use crate::recorded::{self, Lacks};
 
 /// Files in the formats of others.
 #[derive(Clone, Debug, clap::Args)]
-pub struct Others {
+pub struct OtherFormats {
     /// Write each track's flight as GeoJSON (WGS84); needs --anchor, as do all but --foxglove.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     geojson: Option<PathBuf>,
@@ -53,7 +53,7 @@ pub struct Others {
     formats: FormatArgs,
 }
 
-impl Others {
+impl OtherFormats {
     /// Writes the formats that are asked for.
     pub fn write(&self, recording: &Path, channel: &Channel) -> anyhow::Result<()> {
         let site = site_of(recording)?;

@@ -12,7 +12,7 @@ use anyhow::Context;
 use crossfix_message::Timestamp;
 use crossfix_outlet::Outlet;
 
-use super::Heard;
+use super::HeardSince;
 use super::tls::{TlsClient, TlsStream};
 use crate::pace::wall_seconds;
 
@@ -86,7 +86,7 @@ impl fmt::Display for Destination {
 }
 
 /// An open connection to the receiver.
-enum Way {
+enum Connection {
     Datagrams(UdpSocket),
     Plain(TcpStream),
     Encrypted(Box<TlsStream>),
@@ -94,7 +94,7 @@ enum Way {
     Stdout,
 }
 
-impl Way {
+impl Connection {
     fn open(destination: &Destination, tls: Option<&TlsClient>) -> io::Result<Self> {
         Ok(match destination {
             Destination::Udp(address) => {
@@ -173,7 +173,7 @@ fn connect(address: &str) -> io::Result<TcpStream> {
 pub struct Carrier {
     destination: Destination,
     tls: Option<TlsClient>,
-    way: Option<Way>,
+    way: Option<Connection>,
     /// When the connection was last opened or tried to be opened.
     tried_at: Option<Instant>,
     complained_at: Option<Instant>,
@@ -219,18 +219,18 @@ impl Carrier {
     ///
     /// # Errors
     /// If trying again is useless: a file or a pipe that takes no more.
-    pub fn say(&mut self, outlet: &mut dyn Outlet, heard: &mut Heard) -> anyhow::Result<()> {
+    pub fn say(&mut self, outlet: &mut dyn Outlet, heard: &mut HeardSince) -> anyhow::Result<()> {
         let said = self.try_to_say(outlet, heard);
         self.mind(said)
     }
 
-    fn try_to_say(&mut self, outlet: &mut dyn Outlet, heard: &mut Heard) -> io::Result<()> {
+    fn try_to_say(&mut self, outlet: &mut dyn Outlet, heard: &mut HeardSince) -> io::Result<()> {
         if self.way.is_none() {
             if self.tried_at.is_some_and(|at| at.elapsed() < RETRY) {
                 return Ok(());
             }
             self.tried_at = Some(Instant::now());
-            self.way = Some(Way::open(&self.destination, self.tls.as_ref())?);
+            self.way = Some(Connection::open(&self.destination, self.tls.as_ref())?);
             self.put(outlet.greeting(Timestamp::from_seconds(wall_seconds())))?;
         }
         if !outlet.is_ready() {

@@ -154,7 +154,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let subscription = link.subscribe(&[channels.as_slice(), &[calibrations]].concat())?;
     tracing::info!("telling {} where the targets of `{site}` are", args.to);
 
-    let mut heard = Heard {
+    let mut heard = HeardSince {
         situation: Situation::new(site, anchor),
         tracks_at: Instant::now(),
         events: Vec::new(),
@@ -183,7 +183,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 /// What the site has published since the outlet last sent something.
-struct Heard {
+struct HeardSince {
     situation: Situation,
     /// When the fusion centre last published tracks.
     tracks_at: Instant,
@@ -191,7 +191,7 @@ struct Heard {
     repeats: Repeats,
 }
 
-impl Heard {
+impl HeardSince {
     /// Positions of all targets now.
     fn snapshot(&mut self) -> Option<Snapshot> {
         self.situation.snapshot(self.tracks_at.elapsed().as_secs_f64())

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use crossfix_evaluation::bound::{Candidate, PlannedCamera};
+use crossfix_evaluation::bound::{CandidatePlace, PlannedCamera};
 use crossfix_view::{Landmark, VolumeCell, VolumePicture};
 use nalgebra::Point3;
 
@@ -21,7 +21,7 @@ fn legend(report: &Report) -> String {
     )
 }
 
-fn landmark(report: &Report, candidate: &Candidate) -> Landmark {
+fn landmark(report: &Report, candidate: &CandidatePlace) -> Landmark {
     let rank = report.best.iter().position(|best| best == candidate);
     let sd = candidate.score.median_sd_m;
     Landmark {

@@ -1,8 +1,8 @@
 //! The results of a plan, for programs and for people.
 
 use crossfix_evaluation::bound::{
-    Advice, Assumptions, Candidate, Cell, Contribution, PlannedCamera, Score, Summary, TargetSize,
-    Volume, advise, contributions, layers, predict, smallest_target,
+    Advice, Assumptions, CandidatePlace, Cell, Contribution, PlannedCamera, Score, Summary,
+    TargetSize, Volume, advise, contributions, layers, predict, smallest_target,
 };
 use serde::Serialize;
 
@@ -29,7 +29,7 @@ pub struct Report {
     pub layers: Vec<Summary>,
     pub cameras: Vec<Contribution>,
     pub advice: Option<Advice>,
-    pub best: Vec<Candidate>,
+    pub best: Vec<CandidatePlace>,
     pub cells: Vec<Cell>,
 }
 

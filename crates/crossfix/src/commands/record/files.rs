@@ -94,7 +94,7 @@ struct Removed {
 
 /// The files of a recorder.
 #[derive(Debug)]
-pub struct Files {
+pub struct RecordFiles {
     asked: PathBuf,
     overwrite: bool,
     limits: Limits,
@@ -110,7 +110,7 @@ pub struct Files {
     repeats: Repeats,
 }
 
-impl Files {
+impl RecordFiles {
     /// Files under a name or, with rotation, under names that begin with it.
     ///
     /// # Errors
@@ -346,7 +346,7 @@ mod tests {
     fn the_oldest_files_go_and_nothing_that_is_not_the_recorders() {
         let folder = tempfile::tempdir().unwrap();
         let asked = folder.path().join("site.mcap");
-        let mut files = Files::new(&asked, false, limits(Some(2.5e-3))).unwrap();
+        let mut files = RecordFiles::new(&asked, false, limits(Some(2.5e-3))).unwrap();
         let others = [
             "site.mcap",
             "site-2.mcap",
@@ -379,7 +379,8 @@ mod tests {
     #[test]
     fn files_of_one_second_have_names_of_their_own_and_are_the_recorders() {
         let folder = tempfile::tempdir().unwrap();
-        let mut files = Files::new(&folder.path().join("a.mcap"), false, limits(None)).unwrap();
+        let mut files =
+            RecordFiles::new(&folder.path().join("a.mcap"), false, limits(None)).unwrap();
         for _ in 0..3 {
             drop(files.create(&Source::default()).unwrap());
         }
@@ -417,11 +418,11 @@ mod tests {
         // More than any disk has, so no removal suffices.
         let endless = Limits { leave_free_gb: 1e12, ..limits(None) };
         for k in 0..30 {
-            let files = Files::new(&folder.path().join("a.mcap"), false, endless).unwrap();
+            let files = RecordFiles::new(&folder.path().join("a.mcap"), false, endless).unwrap();
             // Sparse files: they have a large size, but occupy nothing.
             File::create(files.named(at(k))).unwrap().set_len(1 << 40).unwrap();
         }
-        let mut files = Files::new(&folder.path().join("a.mcap"), false, endless).unwrap();
+        let mut files = RecordFiles::new(&folder.path().join("a.mcap"), false, endless).unwrap();
         drop(files.create(&Source::default()).unwrap());
         let rooms: Vec<Room> = (0..40).map(|_| files.make_room()).collect();
         assert_eq!(rooms.last(), Some(&Room::Tracks));
@@ -433,7 +434,7 @@ mod tests {
     fn what_this_run_has_recorded_is_younger_than_what_was_there_before() {
         let folder = tempfile::tempdir().unwrap();
         let asked = folder.path().join("a.mcap");
-        let mut files = Files::new(&asked, false, limits(Some(1e-9))).unwrap();
+        let mut files = RecordFiles::new(&asked, false, limits(Some(1e-9))).unwrap();
         let later = files.named(OffsetDateTime::now_utc() + time::Duration::days(9000));
         std::fs::write(&later, vec![0; 10]).unwrap();
         drop(files.create(&Source::default()).unwrap());
@@ -447,9 +448,9 @@ mod tests {
     fn what_another_recorder_writes_is_left_to_it_and_what_is_taken_away_is_begun_anew() {
         let folder = tempfile::tempdir().unwrap();
         let asked = folder.path().join("a.mcap");
-        let mut one = Files::new(&asked, false, limits(Some(1e-9))).unwrap();
+        let mut one = RecordFiles::new(&asked, false, limits(Some(1e-9))).unwrap();
         drop(one.create(&Source::default()).unwrap());
-        let mut other = Files::new(&asked, false, limits(Some(1e-9))).unwrap();
+        let mut other = RecordFiles::new(&asked, false, limits(Some(1e-9))).unwrap();
         drop(other.create(&Source::default()).unwrap());
         for _ in 0..3 {
             let _ = other.make_room();
@@ -462,7 +463,7 @@ mod tests {
     #[test]
     fn limits_that_do_not_go_together_are_refused() {
         let alone = Limits { rotate_mb: None, ..limits(Some(1.0)) };
-        assert!(Files::new(Path::new("a.mcap"), false, alone).is_err());
-        assert!(Files::new(Path::new("a.mcap"), true, limits(None)).is_err());
+        assert!(RecordFiles::new(Path::new("a.mcap"), false, alone).is_err());
+        assert!(RecordFiles::new(Path::new("a.mcap"), true, limits(None)).is_err());
     }
 }

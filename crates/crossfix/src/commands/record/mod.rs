@@ -13,7 +13,7 @@ use crossfix_message::{Channel, Key};
 use crossfix_recording::{RecordingError, Source};
 use crossfix_transport::{Delivery, Role, Subscription};
 
-use self::files::{Files, Limits, Room};
+use self::files::{Limits, RecordFiles, Room};
 use self::foxglove::WithFoxglove;
 use self::pictures::VideoArgs;
 use self::recorder::Recorder;
@@ -67,7 +67,7 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen().with_reload().with_stdin(args.stop_with_stdin);
     let network = config::load_network(&args.config)?;
-    let mut files = Files::new(&args.output, args.overwrite, args.limits)?;
+    let mut files = RecordFiles::new(&args.output, args.overwrite, args.limits)?;
     // The file is created last: a recorder that cannot start must not touch it.
     let Some(link) = network::open(&network, &Role::Recorder, &shutdown)? else {
         return Ok(());
@@ -110,7 +110,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 /// The files on the disk, and their syncing.
 struct Disk {
-    files: Files,
+    files: RecordFiles,
     source: Source,
     syncing: Syncing,
     /// When a failed file was last replaced by a new one.

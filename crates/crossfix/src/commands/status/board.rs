@@ -32,14 +32,14 @@ fn printable(text: &str) -> String {
 
 /// A component's last health message, and when it was received.
 #[derive(Clone, Debug)]
-struct Heard {
+struct HeardHealth {
     health: Health,
     at: Instant,
 }
 
 /// State of one component of a site.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Part {
+pub struct ComponentState {
     /// The camera's name, `fusion` (`fusion-west` of an area) or `recorder`.
     pub name: String,
     /// The component's state in a word or two.
@@ -70,7 +70,7 @@ pub struct Part {
 pub struct Status {
     pub site: String,
     /// The cameras of the network's file, the fusion centre, and the recorder if it is heard.
-    pub parts: Vec<Part>,
+    pub parts: Vec<ComponentState>,
     /// Number of tracks that are confirmed or coasting.
     pub confirmed: usize,
     /// Number of tracks that only one camera follows.
@@ -84,7 +84,7 @@ pub struct Board {
     cameras: Vec<CameraName>,
     /// Names of the fusion centres: `fusion`, or `fusion-west` and so on.
     centres: Vec<String>,
-    parts: BTreeMap<String, Heard>,
+    parts: BTreeMap<String, HeardHealth>,
     tracks: BTreeMap<u64, (TrackState, Instant)>,
 }
 
@@ -117,7 +117,7 @@ impl Board {
             _ => return,
         };
         if let Ok(health) = decode(data) {
-            self.parts.insert(name, Heard { health, at });
+            self.parts.insert(name, HeardHealth { health, at });
         }
     }
 
@@ -134,7 +134,7 @@ impl Board {
     /// The state of the site now.
     pub fn status(&self, now: Instant) -> Status {
         // Clock estimates of a fusion centre that has died are out of date.
-        let is_heard = |heard: &&Heard| now.saturating_duration_since(heard.at) <= SILENT;
+        let is_heard = |heard: &&HeardHealth| now.saturating_duration_since(heard.at) <= SILENT;
         let heard = self.centres.iter().filter_map(|centre| self.parts.get(centre));
         let clocks: Vec<&CameraHealth> =
             heard.filter(is_heard).flat_map(|heard| &heard.health.cameras).collect();
@@ -161,7 +161,7 @@ impl Board {
         }
     }
 
-    fn part(&self, name: &str, clock: Option<&CameraHealth>, now: Instant) -> Part {
+    fn part(&self, name: &str, clock: Option<&CameraHealth>, now: Instant) -> ComponentState {
         let nobody = Health::default();
         let heard = self.parts.get(name);
         // For a camera that is not heard, earlier clock estimates say nothing.
@@ -169,7 +169,7 @@ impl Board {
         let health = heard.map_or(&nobody, |heard| &heard.health);
         let load = health.load.as_ref();
         let p99_us = health.counters.iter().find(|one| one.name == "arrival_to_bearings_p99_us");
-        Part {
+        ComponentState {
             name: name.to_owned(),
             state: state(heard, clock, now),
             rate_hz: health.rate_hz,
@@ -191,8 +191,8 @@ impl Board {
 }
 
 /// A component's state in a word or two.
-fn state(heard: Option<&Heard>, clock: Option<&CameraHealth>, now: Instant) -> String {
-    let Some(Heard { health, at }) = heard else { return "not heard".to_owned() };
+fn state(heard: Option<&HeardHealth>, clock: Option<&CameraHealth>, now: Instant) -> String {
+    let Some(HeardHealth { health, at }) = heard else { return "not heard".to_owned() };
     let silent = now.saturating_duration_since(*at);
     let word = match clock.map(CameraHealth::standing) {
         _ if health.ended => "has ended",
@@ -220,7 +220,7 @@ impl Status {
             "C",
         ];
         let mut rows = vec![head.map(str::to_owned).to_vec()];
-        rows.extend(self.parts.iter().map(Part::row));
+        rows.extend(self.parts.iter().map(ComponentState::row));
         let mut lines = vec![format!("site `{}`", self.site), output::table(&rows)];
         let [confirmed, one_camera] = [self.confirmed, self.one_camera];
         lines.push(format!(
@@ -233,7 +233,7 @@ impl Status {
     }
 }
 
-impl Part {
+impl ComponentState {
     fn row(&self) -> Vec<String> {
         let number = |value: Option<f64>, digits: usize| {
             value.map_or(String::new(), |value| format!("{value:.digits$}"))

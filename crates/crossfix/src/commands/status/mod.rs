@@ -11,7 +11,7 @@ use crossfix_message::{Key, SiteName};
 use crossfix_transport::{Link, NetworkConfig, Role};
 
 use self::board::Board;
-use self::page::{Page, Shown};
+use self::page::{Page, PageEvent};
 use self::plan::PlanBoard;
 use crate::config;
 use crate::network;
@@ -144,7 +144,7 @@ fn serve(
         }
         if shown_at.elapsed() >= page::PERIOD {
             shown_at = Instant::now();
-            page.show(&Shown { status: board.status(shown_at), plan: plan.plan(shown_at) })?;
+            page.show(&PageEvent { status: board.status(shown_at), plan: plan.plan(shown_at) })?;
         }
     }
     Ok(())

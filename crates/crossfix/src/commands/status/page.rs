@@ -33,7 +33,7 @@ pub const PERIOD: Duration = Duration::from_millis(200);
 
 /// Data of one event for the page.
 #[derive(Debug, Serialize)]
-pub struct Shown {
+pub struct PageEvent {
     pub status: Status,
     pub plan: Plan,
 }
@@ -63,7 +63,7 @@ impl Page {
     }
 
     /// Sends the site's current state to all clients. Slow clients miss the states in between.
-    pub fn show(&self, shown: &Shown) -> anyhow::Result<()> {
+    pub fn show(&self, shown: &PageEvent) -> anyhow::Result<()> {
         let event = format!("data: {}\n\n", serde_json::to_string(shown)?);
         self.shown.send_replace(event.into());
         Ok(())

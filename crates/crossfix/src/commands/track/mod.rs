@@ -167,7 +167,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 /// The tracker that the arguments ask for, with the targets to follow from the first frame on.
 fn tracker(args: &Args) -> anyhow::Result<ImageTracker> {
     let mut config: TrackerConfig = match &args.config {
-        Some(path) => config::load(path, &args.sets, config::Kind::Tracker)?,
+        Some(path) => config::load(path, &args.sets, config::FileKind::Tracker)?,
         None => config::parse("", &args.sets)?,
     };
     if (args.detect || args.places.is_empty()) && config.detector.is_none() {

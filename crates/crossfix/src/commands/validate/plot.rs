@@ -8,12 +8,12 @@ use std::ops::Range;
 use std::path::Path;
 
 use anyhow::anyhow;
-use crossfix_evaluation::{Row, Table};
+use crossfix_evaluation::{Table, TableRow};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-type Failure = Box<dyn std::error::Error>;
+type PlotArea<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type PlotFailure = Box<dyn std::error::Error>;
 
 /// Width of a figure, px, and least height of one with curves.
 const SIZE: (u32, u32) = (1200, 600);
@@ -39,12 +39,12 @@ pub fn draw(table: &Table, path: &Path) -> anyhow::Result<()> {
 }
 
 /// An axis that spans some figures, linear or logarithmic.
-struct Axis {
+struct PlotAxis {
     is_logarithmic: bool,
     range: Range<f64>,
 }
 
-impl Axis {
+impl PlotAxis {
     fn of(values: impl Iterator<Item = f64>, may_be_logarithmic: bool) -> Self {
         let (low, high) = values
             .filter(|v| v.is_finite())
@@ -87,12 +87,13 @@ fn sheet<'a>(
     path: &'a Path,
     height: u32,
     colour: fn(Mark) -> RGBColor,
-) -> Result<Area<'a>, Failure> {
+) -> Result<PlotArea<'a>, PlotFailure> {
     let area = SVGBackend::new(path, (SIZE.0, height)).into_drawing_area();
     area.fill(&WHITE)?;
     let area = area.titled(&table.title, ("sans-serif", 20))?;
     let mut x = 16;
-    let has = |figure: fn(&Row) -> Option<f64>| table.rows.iter().any(|row| figure(row).is_some());
+    let has =
+        |figure: fn(&TableRow) -> Option<f64>| table.rows.iter().any(|row| figure(row).is_some());
     let marks = [
         ("ours", Mark::Ours, true),
         ("paper", Mark::Paper, has(|row| row.paper)),
@@ -123,7 +124,12 @@ impl Mark {
         }
     }
 
-    fn draw_at(self, area: &Area<'_>, at: (i32, i32), colour: RGBColor) -> Result<(), Failure> {
+    fn draw_at(
+        self,
+        area: &PlotArea<'_>,
+        at: (i32, i32),
+        colour: RGBColor,
+    ) -> Result<(), PlotFailure> {
         match self {
             Self::Ours => area.draw(&Circle::new(at, 4, colour.filled()))?,
             Self::Paper => area.draw(&Cross::new(at, 4, colour.stroke_width(2)))?,
@@ -134,7 +140,7 @@ impl Mark {
 }
 
 /// Draws a row for each series, with its name in front.
-fn rows(table: &Table, path: &Path) -> Result<(), Failure> {
+fn rows(table: &Table, path: &Path) -> Result<(), PlotFailure> {
     let count = table.rows.len();
     let area = sheet(table, path, FRAME + ROW * count as u32, Mark::colour)?;
     let bars = table.rows.iter().flat_map(|row| {
@@ -142,7 +148,7 @@ fn rows(table: &Table, path: &Path) -> Result<(), Failure> {
         // A bar that reaches 0 must not prevent a logarithmic axis.
         [if row.ours > 0.0 { low.max(row.ours / 4.0) } else { low }, row.ours + row.standard_error]
     });
-    let axis = Axis::of(figures(table).chain(bars), true);
+    let axis = PlotAxis::of(figures(table).chain(bars), true);
     let longest = table.rows.iter().map(|row| row.series.chars().count()).max().unwrap_or(0);
     let mut chart = ChartBuilder::on(&area)
         .x_label_area_size(36)
@@ -181,8 +187,8 @@ fn rows(table: &Table, path: &Path) -> Result<(), Failure> {
 }
 
 /// Draws a curve for each series, with a legend beside.
-fn curves(table: &Table, path: &Path) -> Result<(), Failure> {
-    let mut series: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
+fn curves(table: &Table, path: &Path) -> Result<(), PlotFailure> {
+    let mut series: BTreeMap<&str, Vec<&TableRow>> = BTreeMap::new();
     for row in &table.rows {
         series.entry(&row.series).or_default().push(row);
     }
@@ -192,8 +198,8 @@ fn curves(table: &Table, path: &Path) -> Result<(), Failure> {
     let longest = series.keys().map(|name| name.chars().count()).max().unwrap_or(0);
     let legend_width = (LETTER * longest + 50) as u32;
     let (left, legend) = area.split_horizontally(SIZE.0.saturating_sub(20 + legend_width));
-    let axis = Axis::of(figures(table), true);
-    let across = Axis::of(table.rows.iter().map(|row| row.x), false);
+    let axis = PlotAxis::of(figures(table), true);
+    let across = PlotAxis::of(table.rows.iter().map(|row| row.x), false);
     let mut chart = ChartBuilder::on(&left)
         .x_label_area_size(40)
         .y_label_area_size(60)
@@ -212,7 +218,7 @@ fn curves(table: &Table, path: &Path) -> Result<(), Failure> {
         // Hues around the colour circle, every other one darker.
         let light = if index % 2 == 0 { 0.45 } else { 0.3 };
         let colour = HSLColor(index as f64 / count as f64, 0.75, light);
-        let place = |value: f64, row: &Row| (row.x, axis.place(value));
+        let place = |value: f64, row: &TableRow| (row.x, axis.place(value));
         let ours = rows.iter().filter(|row| row.ours.is_finite()).map(|row| place(row.ours, row));
         chart.draw_series(LineSeries::new(ours, colour.stroke_width(2)).point_size(3))?;
         let papers = rows.iter().filter_map(|row| Some(place(row.paper?, row)));

@@ -131,7 +131,8 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
     let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
     let subscription = link.subscribe(&[Key::everything_of(link.site())])?;
     tracing::info!("showing `{}` until Ctrl-C", link.site());
-    let mut watch = Watch { network, reception: Reception::default(), repeats: Repeats::default() };
+    let mut watch =
+        ViewerFeed { network, reception: Reception::default(), repeats: Repeats::default() };
     let mut looked_at = Instant::now();
     let mut is_watched = true;
     while is_watched && !shutdown.requested() {
@@ -158,13 +159,13 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
 }
 
 /// Selects what the viewer is shown, and counts what it misses.
-struct Watch {
+struct ViewerFeed {
     network: NetworkConfig,
     reception: Reception,
     repeats: Repeats,
 }
 
-impl Watch {
+impl ViewerFeed {
     fn show(&mut self, picture: &mut Picture, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, origin, at } = received;
         if !self.network.names(key) {

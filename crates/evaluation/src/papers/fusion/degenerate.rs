@@ -8,8 +8,8 @@ use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Row, Table, mean, root_mean_square, share};
-use super::site::{LAYOUTS, Layout, PERIODS, Target, line, tangent_noise};
+use super::super::table::{Limit, Table, TableRow, mean, root_mean_square, share};
+use super::site::{LAYOUTS, PERIODS, PaperSite, StraightTarget, line, tangent_noise};
 use super::{REFERENCE_RUNS, VELOCITY_SD, reference_tolerance};
 
 /// Number of runs of a layout for each run of the options.
@@ -22,7 +22,7 @@ const WORST_CONDITION: f64 = 1e9;
 const SINGULAR: f64 = 1e12;
 
 /// Known figures of a layout, from elsewhere.
-struct Reference {
+struct KnownFigures {
     condition: f64,
     degeneracy: Degeneracy,
     /// `None` where the reference implementation has none.
@@ -51,17 +51,17 @@ const fn reference(
     degeneracy: Degeneracy,
     papers: [f64; 2],
     map: [f64; 2],
-) -> Reference {
-    Reference { condition, degeneracy, errors: Some(ReferenceErrors { papers, map }) }
+) -> KnownFigures {
+    KnownFigures { condition, degeneracy, errors: Some(ReferenceErrors { papers, map }) }
 }
 
 /// A layout that the reference implementation does not have: its condition number is `numpy`'s.
-const fn unreferenced(condition: f64, degeneracy: Degeneracy) -> Reference {
-    Reference { condition, degeneracy, errors: None }
+const fn unreferenced(condition: f64, degeneracy: Degeneracy) -> KnownFigures {
+    KnownFigures { condition, degeneracy, errors: None }
 }
 
 /// Figures of [`LAYOUTS`], in their order.
-const REFERENCES: [Reference; 8] = [
+const REFERENCES: [KnownFigures; 8] = [
     reference(20.0, Degeneracy::Regular, [0.27, 2.2], [0.26, 2.1]),
     reference(202.0, Degeneracy::OfPlace, [1.5, 14.7], [1.3, 12.0]),
     reference(f64::INFINITY, Degeneracy::OfTimes, [6.5, 32.0], [3.2, 16.0]),
@@ -130,8 +130,8 @@ fn answers(lines: &[TimedLine; 3]) -> [Option<Answer>; 3] {
 
 /// The sight lines of the middle period.
 fn lines(
-    layout: &Layout,
-    target: &Target,
+    layout: &PaperSite,
+    target: &StraightTarget,
     mut noise: Option<&mut Noise>,
 ) -> Option<[TimedLine; 3]> {
     let cameras = layout.cameras().ok()?;
@@ -144,7 +144,7 @@ fn lines(
 
 /// A solver's answer in one run, compared with the truth.
 #[derive(Clone, Copy)]
-struct Outcome {
+struct SolverOutcome {
     /// Errors of position, m, and velocity, m/s.
     errors: [f64; 2],
     observability: Option<Observability>,
@@ -152,8 +152,8 @@ struct Outcome {
     rank_is_true: bool,
 }
 
-fn run(layout: &Layout, noise: &mut Noise) -> [Option<Outcome>; 3] {
-    let target = Target::random(noise);
+fn run(layout: &PaperSite, noise: &mut Noise) -> [Option<SolverOutcome>; 3] {
+    let target = StraightTarget::random(noise);
     let (Some(noisy), Some(exact)) =
         (lines(layout, &target, Some(noise)), lines(layout, &target, None))
     else {
@@ -164,7 +164,7 @@ fn run(layout: &Layout, noise: &mut Noise) -> [Option<Outcome>; 3] {
     let mut outcomes = [None; 3];
     for ((outcome, answer), true_rank) in outcomes.iter_mut().zip(answers(&noisy)).zip(ranks) {
         let rank_is_true = rank(&answer) == true_rank;
-        *outcome = answer.map(|answer| Outcome {
+        *outcome = answer.map(|answer| SolverOutcome {
             errors: [
                 (answer.position - target.at(answer.time.seconds())).norm(),
                 (answer.velocity - target.velocity).norm(),
@@ -177,13 +177,18 @@ fn run(layout: &Layout, noise: &mut Noise) -> [Option<Outcome>; 3] {
 }
 
 /// How one solver's fixes describe what they do not determine.
-fn said(series: &str, at: f64, outcomes: &[&Outcome], degeneracy: Degeneracy) -> Vec<Row> {
+fn said(
+    series: &str,
+    at: f64,
+    outcomes: &[&SolverOutcome],
+    degeneracy: Degeneracy,
+) -> Vec<TableRow> {
     let of_solver: Vec<Observability> = outcomes.iter().filter_map(|o| o.observability).collect();
     if of_solver.is_empty() {
         return Vec::new();
     }
     let weak: Vec<WeakAxis> = of_solver.iter().filter_map(|o| o.weak_axis).collect();
-    let row = |what: &str, figure| Row::new(format!("{series}: {what}"), at, figure);
+    let row = |what: &str, figure| TableRow::new(format!("{series}: {what}"), at, figure);
     let mut say_so = row("share that say so", share(of_solver.iter().map(|o| !o.is_full())));
     say_so.limit = match degeneracy {
         Degeneracy::Regular => Some(Limit::AtMost(0.01)),
@@ -227,7 +232,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             run(layout, &mut Noise::new(options.seed, index))
         });
         for (solver, name) in SOLVERS.into_iter().enumerate() {
-            let answered: Vec<&Outcome> =
+            let answered: Vec<&SolverOutcome> =
                 runs.iter().filter_map(|run| run[solver].as_ref()).collect();
             let series = format!("{}: {name}", layout.name);
             let errors = reference.errors.as_ref();
@@ -236,7 +241,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                 let errors: Vec<f64> =
                     answered.iter().map(|outcome| outcome.errors[quantity]).collect();
                 let figure = root_mean_square(&errors);
-                let mut row = Row::new(&series, at, figure);
+                let mut row = TableRow::new(&series, at, figure);
                 if let Some(value) = expected.map(|expected| expected[quantity]) {
                     let digit = [0.01, 1.0][quantity];
                     let tolerance =
@@ -264,12 +269,12 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     ]
 }
 
-fn condition_row(layout: &Layout, reference: &Reference, at: f64) -> Row {
-    let exact = lines(layout, &Target::at_rest(Point3::origin()), None);
+fn condition_row(layout: &PaperSite, reference: &KnownFigures, at: f64) -> TableRow {
+    let exact = lines(layout, &StraightTarget::at_rest(Point3::origin()), None);
     let solution =
         exact.and_then(|[first, second, third]| triple([&first, &second, &third], VELOCITY_SD));
     let condition = solution.map_or(f64::NAN, |s| s.observability.condition_number);
-    let row = Row::new(layout.name, at, (condition, 0.0));
+    let row = TableRow::new(layout.name, at, (condition, 0.0));
     if reference.condition > SINGULAR {
         return row.limit(Limit::AtLeast(SINGULAR));
     }

@@ -14,8 +14,8 @@ use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Row, Table, deviation, mean, share};
-use super::site::{Layout, PERIODS, Target, line, tangent_noise};
+use super::super::table::{Limit, Table, TableRow, deviation, mean, share};
+use super::site::{PERIODS, PaperSite, StraightTarget, line, tangent_noise};
 use super::{REFERENCE_RUNS, reference_tolerance};
 
 /// Number of runs of a cell for each run of the options: a run takes a tenth of a millisecond.
@@ -35,14 +35,14 @@ const VELOCITY_SCALE: f64 = 100.0;
 
 /// What the paper's noise is added to.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Reading {
+enum NoiseReading {
     /// To the coordinates of M(i, j), after the solution.
     Positions,
     /// To all bearings.
     Bearings,
 }
 
-impl Reading {
+impl NoiseReading {
     /// The temporal gate, m.
     fn gate(self) -> f64 {
         match self {
@@ -60,33 +60,33 @@ impl Reading {
 }
 
 /// Mean distance, its standard deviation, and the probability of finding all targets.
-type Figures = [f64; 3];
+type DetectionFigures = [f64; 3];
 
 /// A column of the tables.
-struct Cell {
+struct TableColumn {
     receivers: usize,
     targets: usize,
     delays: [f64; 3],
-    paper: Figures,
+    paper: DetectionFigures,
     /// The reference implementation's figures, by reading.
-    reference: [Figures; 2],
+    reference: [DetectionFigures; 2],
 }
 
 const fn cell(
     targets: usize,
     delays: &[f64],
-    paper: Figures,
-    on_positions: Figures,
-    on_bearings: Figures,
-) -> Cell {
+    paper: DetectionFigures,
+    on_positions: DetectionFigures,
+    on_bearings: DetectionFigures,
+) -> TableColumn {
     let (receivers, delays) = match *delays {
         [two, three] => (3, [0.0, two, three]),
         _ => (2, [0.0, delays[0], 0.0]),
     };
-    Cell { receivers, targets, delays, paper, reference: [on_positions, on_bearings] }
+    TableColumn { receivers, targets, delays, paper, reference: [on_positions, on_bearings] }
 }
 
-const CELLS: [Cell; 8] = [
+const CELLS: [TableColumn; 8] = [
     cell(1, &[0.1], [1.25, 0.89, 1.00], [1.32, 1.01, 0.98], [1.37, 1.02, 0.98]),
     cell(1, &[0.25], [3.10, 2.30, 0.71], [3.20, 2.46, 0.69], [3.35, 2.50, 0.65]),
     cell(2, &[0.1], [1.28, 1.03, 0.97], [1.32, 1.06, 0.96], [1.33, 1.08, 0.96]),
@@ -98,7 +98,7 @@ const CELLS: [Cell; 8] = [
 ];
 
 /// Result of one run: the distance of each target from its own group, if there is one.
-struct Found {
+struct RunResult {
     distances: Vec<f64>,
     all: bool,
     /// Whether the estimated number of targets is right.
@@ -173,12 +173,13 @@ fn period_fix(
 }
 
 fn run(
-    cell: &Cell,
-    reading: Reading,
+    cell: &TableColumn,
+    reading: NoiseReading,
     cameras: &[(CameraName, Camera)],
     noise: &mut Noise,
-) -> Found {
-    let targets: Vec<Target> = (0..cell.targets).map(|_| Target::random(noise)).collect();
+) -> RunResult {
+    let targets: Vec<StraightTarget> =
+        (0..cell.targets).map(|_| StraightTarget::random(noise)).collect();
     let mut grouping = Grouping::new(GroupingRules {
         periods: PERIODS,
         fixes: PERIODS,
@@ -191,7 +192,8 @@ fn run(
         let seen = cameras.iter().zip(cell.delays).map(|((name, camera), delay)| {
             let time = period as f64 + delay;
             let lines = targets.iter().enumerate().filter_map(|(index, target)| {
-                let offset = tangent_noise((reading == Reading::Bearings).then_some(&mut *noise));
+                let offset =
+                    tangent_noise((reading == NoiseReading::Bearings).then_some(&mut *noise));
                 let id = (name.clone(), period as u64, index);
                 Some((id, line(camera, target.at(time), offset, time)?))
             });
@@ -199,7 +201,7 @@ fn run(
         });
         let lines: Vec<Vec<(LineId, TimedLine)>> = seen.collect();
         let mut fixes = fixes(&lines);
-        if reading == Reading::Positions {
+        if reading == NoiseReading::Positions {
             for fix in &mut fixes {
                 for axis in 0..3 {
                     fix.fix.state.mean[axis] += POSITION_SD * noise.normal();
@@ -214,7 +216,7 @@ fn run(
     let places: Vec<Point3<f64>> = targets.iter().map(|target| target.at(time)).collect();
     let distances = matched(&places, &ends);
     let near = distances.iter().filter(|&&distance| distance <= MATCH_GATE).count();
-    Found {
+    RunResult {
         all: near == targets.len(),
         counted: grouping.target_count() == targets.len(),
         distances,
@@ -243,8 +245,12 @@ fn matched(places: &[Point3<f64>], ends: &[Point3<f64>]) -> Vec<f64> {
 
 /// Mean distance, SD and probability of a cell, and the share of runs whose number of targets is
 /// right, each with its standard error and number of samples.
-fn figures(options: ValidationOptions, cell: &Cell, reading: Reading) -> [((f64, f64), usize); 4] {
-    let layout = Layout::orthogonal("", cell.delays);
+fn figures(
+    options: ValidationOptions,
+    cell: &TableColumn,
+    reading: NoiseReading,
+) -> [((f64, f64), usize); 4] {
+    let layout = PaperSite::orthogonal("", cell.delays);
     let cameras = layout.cameras().unwrap_or_default();
     let names = ["first", "second", "third"].into_iter().filter_map(|name| name.parse().ok());
     let cameras: Vec<(CameraName, Camera)> = names.zip(cameras).take(cell.receivers).collect();
@@ -264,9 +270,9 @@ fn figures(options: ValidationOptions, cell: &Cell, reading: Reading) -> [((f64,
 
 /// Tables 1 and 2 with both readings.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
-    let mut rows: [Vec<Row>; 4] = Default::default();
+    let mut rows: [Vec<TableRow>; 4] = Default::default();
     for cell in &CELLS {
-        for reading in [Reading::Positions, Reading::Bearings] {
+        for reading in [NoiseReading::Positions, NoiseReading::Bearings] {
             let receivers = if cell.receivers == 2 { "two" } else { "three" };
             let series = format!("{receivers} receivers, m = {}, {}", cell.targets, reading.name());
             let reference = cell.reference[reading as usize];
@@ -274,7 +280,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                 figures(options, cell, reading).into_iter().enumerate()
             {
                 let Some(&value) = reference.get(quantity) else {
-                    rows[quantity].push(Row::new(&series, cell.delays[1], figure));
+                    rows[quantity].push(TableRow::new(&series, cell.delays[1], figure));
                     continue;
                 };
                 let probability = quantity == 2;
@@ -287,7 +293,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                     tolerance = (3.0 * variance.sqrt()).max(3.0 / REFERENCE_RUNS as f64) + 0.005;
                 }
                 rows[quantity].push(
-                    Row::new(&series, cell.delays[1], figure)
+                    TableRow::new(&series, cell.delays[1], figure)
                         .paper(cell.paper[quantity])
                         .reference(value)
                         .limit(Limit::Near { value, tolerance }),

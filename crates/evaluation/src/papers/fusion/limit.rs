@@ -15,8 +15,10 @@ use crate::bound::{BearingNoise, FisherInformation, LineGeometry};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
-use super::site::{BEARING_SD, LAYOUTS, Layout, PERIODS, Target, bearing, line, tangent_noise};
+use super::super::table::{Limit, Table, TableRow, mean, root_mean_square, root_ratio, share};
+use super::site::{
+    BEARING_SD, LAYOUTS, PERIODS, PaperSite, StraightTarget, bearing, line, tangent_noise,
+};
 
 /// Mean NEES of position and velocity if the covariance is consistent; the tolerance is the scatter
 /// of 4000 runs.
@@ -31,7 +33,11 @@ const DIVERGED_M: f64 = 100.0;
 /// The Cramer-Rao bound at the truth: the least covariance of position and velocity at a time that
 /// any unbiased estimator can have from bearings of a target. `None` if they do not determine all
 /// six numbers.
-fn bound(lines: &[TimedLine], target: &Target, reference: Timestamp) -> Option<Matrix6<f64>> {
+fn bound(
+    lines: &[TimedLine],
+    target: &StraightTarget,
+    reference: Timestamp,
+) -> Option<Matrix6<f64>> {
     let mut information = FisherInformation::default();
     let noise = BearingNoise::isotropic(BEARING_SD)?;
     for TimedLine { line, time, .. } in lines {
@@ -42,7 +48,7 @@ fn bound(lines: &[TimedLine], target: &Target, reference: Timestamp) -> Option<M
 }
 
 /// One bearing of one camera.
-struct Seen {
+struct TimedBearing {
     camera: usize,
     period: usize,
     time_s: f64,
@@ -50,23 +56,23 @@ struct Seen {
 }
 
 /// A run's target and all bearings of it, in order of their times.
-struct Flight {
-    target: Target,
-    seen: Vec<Seen>,
+struct LimitRun {
+    target: StraightTarget,
+    seen: Vec<TimedBearing>,
     /// The same bearings without noise.
     exact: Vec<TimedLine>,
 }
 
-impl Flight {
-    fn new(layout: &Layout, cameras: &[Camera], noise: &mut Noise) -> Option<Self> {
-        let target = Target::random(noise);
+impl LimitRun {
+    fn new(layout: &PaperSite, cameras: &[Camera], noise: &mut Noise) -> Option<Self> {
+        let target = StraightTarget::random(noise);
         let (mut seen, mut exact) = (Vec::new(), Vec::new());
         for period in 0..PERIODS {
             for (index, (camera, delay)) in cameras.iter().zip(layout.delays).enumerate() {
                 let time_s = period as f64 + delay;
                 let place = target.at(time_s);
                 let bearing = bearing(camera, place, tangent_noise(Some(noise)))?;
-                seen.push(Seen { camera: index, period, time_s, bearing });
+                seen.push(TimedBearing { camera: index, period, time_s, bearing });
                 exact.push(line(camera, place, tangent_noise(None), time_s)?);
             }
         }
@@ -81,7 +87,7 @@ impl Flight {
 }
 
 /// An estimate at the time of the last bearing, compared with the truth.
-struct Outcome {
+struct EstimateError {
     /// Errors of position, m, and velocity, m/s.
     errors: [f64; 2],
     nees: f64,
@@ -90,8 +96,8 @@ struct Outcome {
     bound: [f64; 2],
 }
 
-impl Outcome {
-    fn of(flight: &Flight, state: &KinematicState) -> Option<Self> {
+impl EstimateError {
+    fn of(flight: &LimitRun, state: &KinematicState) -> Option<Self> {
         let time = flight.end();
         let limit = bound(&flight.exact, &flight.target, time)?;
         let truth = flight.target.at(time.seconds());
@@ -111,7 +117,7 @@ impl Outcome {
 
 /// Result of the whole fusion, with its default configuration, for the messages of a flight: the
 /// confirmed track of the last track frame, the nearest to the truth if there are several.
-fn fused(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
+fn fused(flight: &LimitRun, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
     let mut config = FusionConfig::default();
     config.initiation.velocity_prior_sd_mps = PRIOR_SD;
     let mut fusion = Fusion::new(config).ok()?;
@@ -136,7 +142,7 @@ fn fused(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicS
         .min_by(|a, b| (a.position() - truth).norm().total_cmp(&(b.position() - truth).norm()))
 }
 
-fn frame(seen: &Seen, camera: &CameraName) -> BearingFrame {
+fn frame(seen: &TimedBearing, camera: &CameraName) -> BearingFrame {
     let covariance = seen.bearing.covariance();
     let track = BearingTrack {
         track_id: 1,
@@ -177,29 +183,29 @@ fn confirmed_states(frame: &TrackFrame) -> Vec<KinematicState> {
 /// The outcomes of all runs; `None` where the estimator had no answer.
 fn outcomes(
     options: ValidationOptions,
-    layout: &Layout,
-    estimate: impl Fn(&Flight, &[(CameraName, Camera)]) -> Option<KinematicState> + Sync,
-) -> Vec<Option<Outcome>> {
+    layout: &PaperSite,
+    estimate: impl Fn(&LimitRun, &[(CameraName, Camera)]) -> Option<KinematicState> + Sync,
+) -> Vec<Option<EstimateError>> {
     let cameras = layout.cameras().unwrap_or_default();
     let names = ["first", "second", "third"].into_iter().filter_map(|name| name.parse().ok());
     let named: Vec<(CameraName, Camera)> = names.zip(cameras.iter().cloned()).collect();
     runs::all(options.runs, |index| {
-        let flight = Flight::new(layout, &cameras, &mut Noise::new(options.seed, index))?;
-        Outcome::of(&flight, &estimate(&flight, &named)?)
+        let flight = LimitRun::new(layout, &cameras, &mut Noise::new(options.seed, index))?;
+        EstimateError::of(&flight, &estimate(&flight, &named)?)
     })
 }
 
 /// Rows of the tables that both estimators have.
 #[derive(Default)]
 struct Rows {
-    ratios: Vec<Row>,
-    errors: Vec<Row>,
-    consistency: Vec<Row>,
+    ratios: Vec<TableRow>,
+    errors: Vec<TableRow>,
+    consistency: Vec<TableRow>,
 }
 
 impl Rows {
-    fn add(&mut self, layout: &Layout, at: f64, outcomes: &[Option<Outcome>]) {
-        let known: Vec<&Outcome> = outcomes.iter().flatten().collect();
+    fn add(&mut self, layout: &PaperSite, at: f64, outcomes: &[Option<EstimateError>]) {
+        let known: Vec<&EstimateError> = outcomes.iter().flatten().collect();
         for (index, quantity) in ["position", "velocity"].into_iter().enumerate() {
             let errors: Vec<f64> = known.iter().map(|o| o.errors[index]).collect();
             let bounds: Vec<f64> = known.iter().map(|o| o.bound[index]).collect();
@@ -207,24 +213,24 @@ impl Rows {
             let best = mean(&bounds).0.sqrt();
             let (rms, standard_error) = root_mean_square(&errors);
             let series = format!("{}: {quantity}", layout.name);
-            self.errors.push(Row::new(&series, at, (rms, standard_error)));
-            self.errors.push(Row::new(format!("{series}, bound"), at, (best, 0.0)));
-            let ratio = Row::new(series, at, (rms / best, standard_error / best));
+            self.errors.push(TableRow::new(&series, at, (rms, standard_error)));
+            self.errors.push(TableRow::new(format!("{series}, bound"), at, (best, 0.0)));
+            let ratio = TableRow::new(series, at, (rms / best, standard_error / best));
             self.ratios.push(ratio.limit(Limit::AtMost(1.1)));
         }
         let nees: Vec<f64> = known.iter().map(|o| o.nees).collect();
-        self.consistency.push(Row::new(layout.name, at, mean(&nees)).limit(HONEST));
+        self.consistency.push(TableRow::new(layout.name, at, mean(&nees)).limit(HONEST));
     }
 }
 
-fn table(name: &'static str, title: &str, y: &'static str, rows: Vec<Row>) -> Table {
+fn table(name: &'static str, title: &str, y: &'static str, rows: Vec<TableRow>) -> Table {
     Table { name, title: title.to_owned(), x: "layout", y, rows }
 }
 
 /// The two layouts in which the paper's own system of equations is regular.
-const REGULAR: [Layout; 2] = [
-    Layout::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
-    Layout::orthogonal("orthogonal, 0.3/0.4", [0.0, 0.3, 0.4]),
+const REGULAR: [PaperSite; 2] = [
+    PaperSite::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
+    PaperSite::orthogonal("orthogonal, 0.3/0.4", [0.0, 0.3, 0.4]),
 ];
 
 /// The whole fusion, from messages to the last track frame, with its default configuration.
@@ -251,7 +257,7 @@ pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
 }
 
 /// The batch solution: all bearings at once.
-fn batch(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
+fn batch(flight: &LimitRun, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
     let lines = flight.seen.iter().map(|seen| {
         let line = cameras.get(seen.camera)?.1.sight_line(&seen.bearing);
         Some(TimedLine::exact(line, Timestamp::from_seconds(seen.time_s)))
@@ -261,15 +267,15 @@ fn batch(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicS
 }
 
 /// Number of runs of a layout that diverged: none may.
-fn diverged(layout: &Layout, at: f64, outcomes: &[Option<Outcome>]) -> Row {
+fn diverged(layout: &PaperSite, at: f64, outcomes: &[Option<EstimateError>]) -> TableRow {
     let count = outcomes.iter().flatten().filter(|outcome| outcome.diverged).count();
-    Row::new(layout.name, at, (count as f64, 0.0)).limit(Limit::AtMost(0.0))
+    TableRow::new(layout.name, at, (count as f64, 0.0)).limit(Limit::AtMost(0.0))
 }
 
 /// Share of a layout's runs in which the estimator had an answer: a fusion centre that is not told
 /// how fast targets are may take a few in a thousand for too fast.
-fn confirmed(layout: &Layout, at: f64, outcomes: &[Option<Outcome>]) -> Row {
-    Row::new(layout.name, at, share(outcomes.iter().map(Option::is_some)))
+fn confirmed(layout: &PaperSite, at: f64, outcomes: &[Option<EstimateError>]) -> TableRow {
+    TableRow::new(layout.name, at, share(outcomes.iter().map(Option::is_some)))
         .limit(Limit::AtLeast(0.99))
 }
 
@@ -281,7 +287,7 @@ pub(super) fn degenerate_tables(options: ValidationOptions) -> Vec<Table> {
     for (number, layout) in LAYOUTS.iter().enumerate().skip(1) {
         let at = (number + 1) as f64;
         let (ours, best) = (outcomes(options, layout, fused), outcomes(options, layout, batch));
-        let both: Vec<(&Outcome, &Outcome)> = ours
+        let both: Vec<(&EstimateError, &EstimateError)> = ours
             .iter()
             .zip(&best)
             .filter_map(|(ours, best)| ours.as_ref().zip(best.as_ref()))
@@ -290,11 +296,11 @@ pub(super) fn degenerate_tables(options: ValidationOptions) -> Vec<Table> {
             let ours: Vec<f64> = both.iter().map(|(ours, _)| ours.errors[index].powi(2)).collect();
             let best: Vec<f64> = both.iter().map(|(_, best)| best.errors[index].powi(2)).collect();
             let row =
-                Row::new(format!("{}: {quantity}", layout.name), at, root_ratio(&ours, &best));
+                TableRow::new(format!("{}: {quantity}", layout.name), at, root_ratio(&ours, &best));
             ratios.push(row.limit(Limit::AtMost(1.1)));
         }
         let nees: Vec<f64> = both.iter().map(|(ours, _)| ours.nees).collect();
-        consistency.push(Row::new(layout.name, at, mean(&nees)).limit(HONEST));
+        consistency.push(TableRow::new(layout.name, at, mean(&nees)).limit(HONEST));
         divergences.push(diverged(layout, at, &ours));
         shares.push(confirmed(layout, at, &ours));
     }

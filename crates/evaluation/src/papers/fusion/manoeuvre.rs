@@ -14,7 +14,7 @@ use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
+use super::super::table::{Limit, Table, TableRow, mean, root_mean_square, root_ratio, share};
 
 /// Time between measurements, s (Kalinov 2019: T = 1).
 const STEP: f64 = 1.0;
@@ -39,13 +39,13 @@ const TUNING_SEED: u64 = 0x7455_6e49;
 const DEVIATIONS: [f64; 2] = [0.1, 5.0];
 
 /// A flight: its places in each frame, and the frames after which it has turned.
-struct Flight {
+struct TurningFlight {
     places: Vec<Point3<f64>>,
     turns: Vec<usize>,
     measured: Vec<Point3<f64>>,
 }
 
-impl Flight {
+impl TurningFlight {
     fn new(deviation: f64, noise: &mut Noise) -> Self {
         let mut points: Vec<Point3<f64>> = Vec::new();
         while points.len() < POINTS {
@@ -78,7 +78,7 @@ impl Flight {
 
 /// A filter, or none.
 #[derive(Clone, Debug)]
-enum Method {
+enum FilterChoice {
     /// No filter: the measurement itself.
     Measurement,
     /// One Kalman filter with a density of white acceleration, m^2/s^3.
@@ -93,15 +93,15 @@ enum Method {
 }
 
 /// Result of a method on a flight.
-struct Followed {
+struct FilterErrors {
     /// Squared errors per axis, m^2, means over the judged frames.
     squares: [f64; 3],
     /// Frames with alarms.
     alarms: Vec<usize>,
 }
 
-impl Method {
-    fn follow(&self, flight: &Flight, deviation: f64) -> Followed {
+impl FilterChoice {
+    fn follow(&self, flight: &TurningFlight, deviation: f64) -> FilterErrors {
         let start = KinematicState {
             mean: Vector6::zeros(),
             covariance: Matrix6::identity() * IGNORANCE.powi(2),
@@ -160,7 +160,7 @@ impl Method {
                 *square += (found[axis] - truth[axis]).powi(2) / count;
             }
         }
-        Followed { squares, alarms }
+        FilterErrors { squares, alarms }
     }
 
     fn name(&self) -> String {
@@ -188,16 +188,16 @@ fn update(state: &mut KinematicState, measured: Point3<f64>, spread: &Matrix3<f6
 }
 
 /// The method of least error on the flights for tuning.
-fn tuned(deviation: f64, seed: u64, methods: Vec<Method>) -> Method {
-    let flights: Vec<Flight> = (0..TUNING_RUNS)
-        .map(|run| Flight::new(deviation, &mut Noise::new(seed ^ TUNING_SEED, run)))
+fn tuned(deviation: f64, seed: u64, methods: Vec<FilterChoice>) -> FilterChoice {
+    let flights: Vec<TurningFlight> = (0..TUNING_RUNS)
+        .map(|run| TurningFlight::new(deviation, &mut Noise::new(seed ^ TUNING_SEED, run)))
         .collect();
-    let cost = |method: &Method| -> f64 {
+    let cost = |method: &FilterChoice| -> f64 {
         flights.iter().flat_map(|flight| method.follow(flight, deviation).squares).sum()
     };
     let costs: Vec<f64> = runs::all(methods.len(), |index| cost(&methods[index]));
     let best = methods.into_iter().zip(costs).min_by(|a, b| a.1.total_cmp(&b.1));
-    best.map_or(Method::Measurement, |(method, _)| method)
+    best.map_or(FilterChoice::Measurement, |(method, _)| method)
 }
 
 /// Densities from that of straight flight to that of unpredictable motion, m^2/s^3.
@@ -206,7 +206,7 @@ fn densities() -> impl Iterator<Item = f64> {
 }
 
 /// All methods, tuned for a noise.
-fn methods(deviation: f64, seed: u64) -> Vec<Method> {
+fn methods(deviation: f64, seed: u64) -> Vec<FilterChoice> {
     let model = |density, share| MotionModel { density, share, calm: false };
     // One leg in ten to twenty frames ends.
     let rates = ModeRates { switching_per_s: 1.0, calming_per_s: 1.0, prior_s: 1.0 };
@@ -214,17 +214,17 @@ fn methods(deviation: f64, seed: u64) -> Vec<Method> {
     for quiet in densities() {
         for lively in densities().filter(|lively| *lively >= 10.0 * quiet) {
             let models = MotionModels::new(&[model(quiet, 0.9), model(lively, 0.1)], rates);
-            mixtures.extend(models.map(Method::Imm));
+            mixtures.extend(models.map(FilterChoice::Imm));
         }
     }
     vec![
-        Method::Measurement,
-        Method::Kalman(LOW_DENSITY),
-        tuned(deviation, seed, densities().map(Method::Kalman).collect()),
-        Method::Smoothed(3),
-        Method::Smoothed(5),
-        Method::Smoothed(8),
-        tuned(deviation, seed, densities().map(Method::Nis).collect()),
+        FilterChoice::Measurement,
+        FilterChoice::Kalman(LOW_DENSITY),
+        tuned(deviation, seed, densities().map(FilterChoice::Kalman).collect()),
+        FilterChoice::Smoothed(3),
+        FilterChoice::Smoothed(5),
+        FilterChoice::Smoothed(8),
+        tuned(deviation, seed, densities().map(FilterChoice::Nis).collect()),
         tuned(deviation, seed, mixtures),
     ]
 }
@@ -250,7 +250,7 @@ const REFERENCES: [[Option<f64>; 2]; 8] = [
 
 /// Frames from a turn to its first alarm, where 1 is the first frame that can show the turn; `None`
 /// for a turn without an alarm before the next.
-fn delays(flight: &Flight, alarms: &[usize]) -> Vec<Option<f64>> {
+fn delays(flight: &TurningFlight, alarms: &[usize]) -> Vec<Option<f64>> {
     let ends = flight.turns.iter().skip(1).copied().chain([flight.places.len()]);
     let turns = flight.turns.iter().zip(ends);
     let delay = |(&turn, end): (&usize, usize)| {
@@ -261,12 +261,12 @@ fn delays(flight: &Flight, alarms: &[usize]) -> Vec<Option<f64>> {
 }
 
 /// The rows of the tables for one noise.
-fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
+fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<TableRow>; 3] {
     let deviation = DEVIATIONS[noise_number];
     let methods = methods(deviation, options.seed);
     let results = runs::all(options.runs, |run| {
-        let flight = Flight::new(deviation, &mut Noise::new(options.seed, run));
-        let of = |method: &Method| {
+        let flight = TurningFlight::new(deviation, &mut Noise::new(options.seed, run));
+        let of = |method: &FilterChoice| {
             let followed = method.follow(&flight, deviation);
             let delays = delays(&flight, &followed.alarms);
             (followed.squares, delays)
@@ -280,41 +280,41 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
     for (index, method) in methods.iter().enumerate() {
         for (axis, label) in ["x", "y", "z"].into_iter().enumerate() {
             let roots: Vec<f64> = results.iter().map(|run| run[index].0[axis].sqrt()).collect();
-            let row = Row::new(
+            let row = TableRow::new(
                 format!("{}, {label}", method.name()),
                 deviation,
                 root_mean_square(&roots),
             );
             let reference = REFERENCES[index][noise_number].filter(|_| axis == 0);
-            errors.push(Row { reference, ..row });
+            errors.push(TableRow { reference, ..row });
         }
-        if matches!(method, Method::Smoothed(_)) {
+        if matches!(method, FilterChoice::Smoothed(_)) {
             let over = |other: usize| root_ratio(&all_axes(index), &all_axes(other));
             let row = |other: &str, figure| {
-                Row::new(format!("{} over Kalman, {other}", method.name()), deviation, figure)
+                TableRow::new(format!("{} over Kalman, {other}", method.name()), deviation, figure)
             };
             // "Much better" than a filter without a model of manoeuvres: in the reference twice or
             // five times as good. Compared with a filter tuned for them it loses (errata).
             ratios.push(row("low noise", over(LOW)).limit(Limit::AtMost(0.5)));
             ratios.push(row("tuned", over(TUNED)).limit(Limit::AtLeast(1.0)));
         }
-        if matches!(method, Method::Smoothed(_) | Method::Nis(_)) {
+        if matches!(method, FilterChoice::Smoothed(_) | FilterChoice::Nis(_)) {
             let delays: Vec<Option<f64>> =
                 results.iter().flat_map(|run| run[index].1.clone()).collect();
             let seen: Vec<f64> = delays.iter().flatten().copied().collect();
             let row = |what: &str, figure| {
-                Row::new(format!("{}: {what}", method.name()), deviation, figure)
+                TableRow::new(format!("{}: {what}", method.name()), deviation, figure)
             };
             if !seen.is_empty() {
                 let reference = delay_of_reference(method).filter(|_| noise_number == 0);
-                alarms.push(Row { reference, ..row("frames to the alarm", mean(&seen)) });
+                alarms.push(TableRow { reference, ..row("frames to the alarm", mean(&seen)) });
             }
             alarms.push(row("share of turns seen", share(delays.iter().map(Option::is_some))));
         }
     }
     let between = |one: usize, other: usize, limit| {
         let name = format!("{} over {}", methods[one].name(), methods[other].name());
-        Row::new(name, deviation, root_ratio(&all_axes(one), &all_axes(other))).limit(limit)
+        TableRow::new(name, deviation, root_ratio(&all_axes(one), &all_axes(other))).limit(limit)
     };
     // Which is best: the detector of innovations where turns stand out of the noise, else the
     // interacting models.
@@ -327,17 +327,17 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
 
 /// Frames from a turn to the alarm in the reference, at little noise; it has 2.0 to 2.2 for the
 /// paper's detector.
-fn delay_of_reference(method: &Method) -> Option<f64> {
+fn delay_of_reference(method: &FilterChoice) -> Option<f64> {
     match method {
-        Method::Smoothed(_) => Some(2.1),
-        Method::Nis(_) => Some(1.0),
-        Method::Measurement | Method::Kalman(_) | Method::Imm(_) => None,
+        FilterChoice::Smoothed(_) => Some(2.1),
+        FilterChoice::Nis(_) => Some(1.0),
+        FilterChoice::Measurement | FilterChoice::Kalman(_) | FilterChoice::Imm(_) => None,
     }
 }
 
 /// Fig. 11, and the comparisons that it is meant to show.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
-    let mut tables: [Vec<Row>; 3] = Default::default();
+    let mut tables: [Vec<TableRow>; 3] = Default::default();
     for noise_number in 0..DEVIATIONS.len() {
         for (table, rows) in tables.iter_mut().zip(rows(options, noise_number)) {
             table.extend(rows);

@@ -23,7 +23,7 @@ const ORTHOGONAL: f64 = 35.264_389_682_754_654;
 
 /// Three cameras round the origin, and their delays within each period.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Layout {
+pub(super) struct PaperSite {
     pub name: &'static str,
     /// Azimuths of the lines of sight to the origin, deg.
     azimuths: [f64; 3],
@@ -33,7 +33,7 @@ pub(super) struct Layout {
     pub delays: [f64; 3],
 }
 
-impl Layout {
+impl PaperSite {
     pub const fn orthogonal(name: &'static str, delays: [f64; 3]) -> Self {
         Self { name, azimuths: [0.0, 120.0, 240.0], elevation: ORTHOGONAL, delays }
     }
@@ -67,27 +67,27 @@ impl Layout {
 }
 
 /// The layouts in which the paper's system of equations breaks down, and two in which it does not.
-pub(super) const LAYOUTS: [Layout; 8] = [
-    Layout::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
-    Layout::orthogonal("orthogonal, 0.1/0.11", [0.0, 0.1, 0.11]),
-    Layout::orthogonal("equal delays 0.2/0.2", [0.0, 0.2, 0.2]),
-    Layout::orthogonal("dt2 = 0, dt3 = 0.2", [0.0, 0.0, 0.2]),
-    Layout::orthogonal("synchronous", [0.0, 0.0, 0.0]),
-    Layout::arc("90 degree arc, 5 degrees up", 5.0),
-    Layout::arc("90 degree arc, 1 degree up", 1.0),
-    Layout::arc("coplanar", 0.0),
+pub(super) const LAYOUTS: [PaperSite; 8] = [
+    PaperSite::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
+    PaperSite::orthogonal("orthogonal, 0.1/0.11", [0.0, 0.1, 0.11]),
+    PaperSite::orthogonal("equal delays 0.2/0.2", [0.0, 0.2, 0.2]),
+    PaperSite::orthogonal("dt2 = 0, dt3 = 0.2", [0.0, 0.0, 0.2]),
+    PaperSite::orthogonal("synchronous", [0.0, 0.0, 0.0]),
+    PaperSite::arc("90 degree arc, 5 degrees up", 5.0),
+    PaperSite::arc("90 degree arc, 1 degree up", 1.0),
+    PaperSite::arc("coplanar", 0.0),
 ];
 
 /// A target on a straight line.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Target {
+pub(super) struct StraightTarget {
     middle: Point3<f64>,
     /// Time at which it is at `middle`, s.
     middle_time: f64,
     pub velocity: Vector3<f64>,
 }
 
-impl Target {
+impl StraightTarget {
     /// A random target: uniform within 10 m of the origin on each axis at the middle of the
     /// periods, with a velocity of [`VELOCITY_SD`]. The reference only says "within 10 m"; drawing
     /// from a ball, or another middle time, leaves all layouts but the coplanar one unchanged, and

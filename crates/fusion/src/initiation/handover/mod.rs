@@ -16,13 +16,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_message::{CameraName, Cued, Timestamp};
 
-use self::reading::{Context, Reading, Rules, TOGETHER_S};
-use self::seen::{Seen, TURNING_DENSITY, pose_variance};
+use self::reading::{Reading, ReadingContext, Rules, TOGETHER_S};
+use self::seen::{SeenDirection, TURNING_DENSITY, pose_variance};
 use super::one_target::OneTargetTest;
 use super::{Start, lines_with_pose};
 use crate::cameras::{KnownCamera, Rooted};
-use crate::cueing::Known;
-use crate::motion::Motion;
+use crate::cueing::CueTarget;
+use crate::motion::TrackMotion;
 use crate::spatial::TimedLine;
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::same_target;
@@ -47,7 +47,7 @@ const MAX_TRIED: usize = 50;
 #[derive(Debug)]
 pub(super) struct Handover {
     rules: Rules,
-    seen: BTreeMap<CameraName, Vec<Seen>>,
+    seen: BTreeMap<CameraName, Vec<SeenDirection>>,
     /// Number of directions followed so far.
     count: u64,
 }
@@ -55,7 +55,7 @@ pub(super) struct Handover {
 /// A line (by its index) that continues a direction which the camera follows, with that direction's
 /// number and the time of its first line.
 #[derive(Clone, Copy, Debug)]
-struct Begun {
+struct Continued {
     index: usize,
     number: u64,
     first: Timestamp,
@@ -73,10 +73,10 @@ impl Handover {
 
     /// The sure targets that one camera alone sees, with predictions for cueing: their range is
     /// unknown.
-    pub(super) fn known(&self, now: Timestamp) -> Vec<Known> {
+    pub(super) fn known(&self, now: Timestamp) -> Vec<CueTarget> {
         let range = (NEAREST_M * self.rules.max_range_m).sqrt();
         let sure = self.seen.iter().flat_map(|(camera, seen)| {
-            let open = |one: &&Seen| {
+            let open = |one: &&SeenDirection| {
                 one.is_sure(&self.rules.tracking) && !one.is_lost(now, &self.rules.tracking)
             };
             seen.iter().filter(open).map(move |one| (camera, one))
@@ -90,7 +90,7 @@ impl Handover {
                 let ahead_s = time.seconds_since(one.sight.time);
                 state.predicted(ahead_s, TURNING_DENSITY * range.powi(2))
             };
-            Some(Known::new(of, now, seen_from, expected))
+            Some(CueTarget::new(of, now, seen_from, expected))
         });
         known.collect()
     }
@@ -102,11 +102,11 @@ impl Handover {
         exposure: &Exposure,
         used: &[(usize, TrackId)],
         known: &KnownCamera,
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> Vec<Start> {
         let mut is_owned = vec![false; exposure.sightings.len()];
         used.iter().for_each(|(index, _)| is_owned[*index] = true);
-        let context = Context { exposure, known, motion, is_owned: &is_owned };
+        let context = ReadingContext { exposure, known, motion, is_owned: &is_owned };
         self.forget(exposure.time);
         let begun = self.follow(&context);
         self.advance(&context);
@@ -139,8 +139,8 @@ impl Handover {
 
     /// Continues the directions that the exposure's camera follows; returns the lines that continue
     /// them.
-    fn follow(&mut self, context: &Context<'_>) -> Vec<Begun> {
-        let Context { exposure, known, is_owned, .. } = *context;
+    fn follow(&mut self, context: &ReadingContext<'_>) -> Vec<Continued> {
+        let ReadingContext { exposure, known, is_owned, .. } = *context;
         let factor = exposure.uncertainty.factor;
         let clutter = self.rules.clutter_per_sr(known).ln();
         let with_pose: Vec<TimedLine> = lines_with_pose(exposure).map(|(_, line)| line).collect();
@@ -184,21 +184,21 @@ impl Handover {
             one.pose_variance = pose_variance(&with_pose[index], exposure, index);
             one.line = with_pose[index].clone();
             one.image_track = exposure.sightings[index].image_track;
-            begun.push(Begun { index, number: one.number, first: one.first });
+            begun.push(Continued { index, number: one.number, first: one.first });
         }
         let mut place = 0..;
         seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
         for (index, line) in with_pose.into_iter().enumerate() {
             if !taken[index] && !is_known(index) && seen.len() < MAX_SEEN {
                 self.count += 1;
-                seen.push(Seen::first(self.count, line, exposure, index));
+                seen.push(SeenDirection::first(self.count, line, exposure, index));
             }
         }
         begun
     }
 
     /// Continues the readings that the exposure's lines may belong to.
-    fn advance(&mut self, context: &Context<'_>) {
+    fn advance(&mut self, context: &ReadingContext<'_>) {
         for one in self.seen.values_mut().flatten() {
             one.readings.retain_mut(|reading| reading.advance(context, &self.rules));
         }
@@ -206,12 +206,12 @@ impl Handover {
 
     /// Starts readings: combines what other cameras have lost sight of with what this camera has
     /// begun to see since.
-    fn cross(&mut self, context: &Context<'_>, begun: &[Begun]) {
-        let Context { exposure, known, motion, is_owned } = *context;
+    fn cross(&mut self, context: &ReadingContext<'_>, begun: &[Continued]) {
+        let ReadingContext { exposure, known, motion, is_owned } = *context;
         let now = exposure.time;
         let others = self.seen.iter_mut().filter(|(camera, _)| **camera != exposure.camera);
         let lost = others.flat_map(|(camera, seen)| seen.iter_mut().map(move |one| (camera, one)));
-        let mut lost: Vec<(&CameraName, &mut Seen)> = lost
+        let mut lost: Vec<(&CameraName, &mut SeenDirection)> = lost
             .filter(|(_, one)| {
                 let silent_s = now.seconds_since(one.sight.time);
                 one.is_sure(&self.rules.tracking)
@@ -223,7 +223,7 @@ impl Handover {
         for (camera, one) in lost.into_iter().take(MAX_LOST) {
             let since =
                 begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
-            for &Begun { index, number, .. } in since.filter(|other| !is_owned[other.index]) {
+            for &Continued { index, number, .. } in since.filter(|other| !is_owned[other.index]) {
                 let name = (exposure.camera.clone(), exposure.sequence, index);
                 let is_read = one.readings.iter().any(|reading| reading.newest == name);
                 let is_full = one.readings.len() >= MAX_READINGS || one.tried.len() >= MAX_TRIED;
@@ -256,8 +256,8 @@ impl Handover {
 
     /// Confirms the readings that this exposure has made sure. Other readings of the same lines are
     /// rivals, unless they give the same target.
-    fn settle(&mut self, context: &Context<'_>) -> Vec<Start> {
-        let Context { exposure, motion, .. } = *context;
+    fn settle(&mut self, context: &ReadingContext<'_>) -> Vec<Start> {
+        let ReadingContext { exposure, motion, .. } = *context;
         let is_new = |reading: &Reading| {
             let (camera, sequence, _) = &reading.newest;
             *camera == exposure.camera && *sequence == exposure.sequence

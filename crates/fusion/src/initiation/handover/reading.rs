@@ -6,9 +6,9 @@ use crossfix_message::CameraName;
 use super::super::MAX_LINES;
 use super::super::one_target::OneTargetTest;
 use crate::cameras::{KnownCamera, view_sr};
-use crate::motion::Motion;
+use crate::motion::TrackMotion;
 use crate::spatial::LineId;
-use crate::track::{Expectation, Track};
+use crate::track::{Track, TrackExpectation};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
@@ -48,15 +48,15 @@ impl Rules {
 
 /// The newest exposure with what its lines are compared by.
 #[derive(Clone, Copy)]
-pub(super) struct Context<'a> {
+pub(super) struct ReadingContext<'a> {
     pub(super) exposure: &'a Exposure,
     pub(super) known: &'a KnownCamera,
-    pub(super) motion: &'a Motion,
+    pub(super) motion: &'a TrackMotion,
     /// Whether a line belongs to a track, by index.
     pub(super) is_owned: &'a [bool],
 }
 
-impl Context<'_> {
+impl ReadingContext<'_> {
     /// The uncertainty of the exposure's camera. The clock's error counts as noise: what it shifts
     /// is not known before the velocity is.
     pub(super) fn uncertainty(&self) -> CameraUncertainty {
@@ -64,7 +64,7 @@ impl Context<'_> {
     }
 
     /// The bearing of a track that is predicted for the exposure's camera.
-    pub(super) fn expectation(&self, track: &Track) -> Option<Expectation> {
+    pub(super) fn expectation(&self, track: &Track) -> Option<TrackExpectation> {
         let seen_from = (&self.exposure.camera, self.known.camera.pose().position());
         track.expectation(self.exposure.time, seen_from, &self.uncertainty(), self.motion)
     }
@@ -83,8 +83,8 @@ pub(super) struct Reading {
 impl Reading {
     /// Updates the reading with the exposure's best line; returns whether the reading is still
     /// open: not if that line belongs to a track.
-    pub(super) fn advance(&mut self, context: &Context<'_>, rules: &Rules) -> bool {
-        let Context { exposure, known, is_owned, .. } = *context;
+    pub(super) fn advance(&mut self, context: &ReadingContext<'_>, rules: &Rules) -> bool {
+        let ReadingContext { exposure, known, is_owned, .. } = *context;
         let Some(expected) = context.expectation(&self.track) else {
             return true;
         };
@@ -108,13 +108,13 @@ impl Reading {
     /// Updates the reading with a line; `None` if the numbers fail.
     pub(super) fn take(
         &mut self,
-        context: &Context<'_>,
+        context: &ReadingContext<'_>,
         index: usize,
-        expected: &Expectation,
+        expected: &TrackExpectation,
         first_ratio: f64,
         rules: &Rules,
     ) -> Option<()> {
-        let Context { exposure, motion, .. } = *context;
+        let ReadingContext { exposure, motion, .. } = *context;
         let Exposure { camera, time, uncertainty, sightings, .. } = exposure;
         let line = &sightings[index].line;
         let density = motion.density(self.track.model_probabilities());
@@ -128,11 +128,11 @@ impl Reading {
         });
         let first_ratio = if is_joint { 0.0 } else { first_ratio };
         match expected {
-            Expectation::Near(prediction) => {
+            TrackExpectation::Near(prediction) => {
                 self.one_target.see(camera, timed, prediction, (density, rules.speed), first_ratio);
             }
-            Expectation::Along { .. } if self.one_target.knows(camera) => {}
-            Expectation::Along { .. } => {
+            TrackExpectation::Along { .. } if self.one_target.knows(camera) => {}
+            TrackExpectation::Along { .. } => {
                 let range = (self.track.state().position() - line.origin).norm();
                 self.one_target.see_first(camera, (line, *time), rules.speed / range, first_ratio);
             }

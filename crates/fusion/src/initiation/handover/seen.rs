@@ -7,9 +7,9 @@ use crossfix_geometry::{BearingModel, SightLine, passing_ranges};
 use crossfix_message::{CameraName, Solver, Timestamp};
 use nalgebra::{Matrix3, Vector3, Vector6};
 
-use super::super::sight::Sight;
+use super::super::sight::DirectionFilter;
 use super::reading::Reading;
-use crate::motion::Motion;
+use crate::motion::TrackMotion;
 use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
 use crate::track::Track;
 use crate::uncertainty::CameraUncertainty;
@@ -32,12 +32,12 @@ const LOST: f64 = -4.6;
 
 /// A direction that one camera alone follows, at the time of its last line.
 #[derive(Clone, Debug)]
-pub(super) struct Seen {
+pub(super) struct SeenDirection {
     /// Its number: tells directions apart that begin with the same exposure.
     pub(super) number: u64,
     /// The number of the camera's own image track.
     pub(super) image_track: u64,
-    pub(super) sight: Sight,
+    pub(super) sight: DirectionFilter,
     /// Time of its first line.
     pub(super) first: Timestamp,
     /// Its last line, with the uncertainty of the camera's pose included in the line's covariance,
@@ -60,13 +60,13 @@ pub(super) struct Seen {
     pub(super) tried: BTreeSet<u64>,
 }
 
-impl Seen {
+impl SeenDirection {
     pub(super) fn first(number: u64, line: TimedLine, exposure: &Exposure, index: usize) -> Self {
         let time = exposure.time;
         Self {
             number,
             image_track: exposure.sightings[index].image_track,
-            sight: Sight::first(&exposure.sightings[index].line, time, TURNING_SD),
+            sight: DirectionFilter::first(&exposure.sightings[index].line, time, TURNING_SD),
             first: time,
             pose_variance: pose_variance(&line, exposure, index),
             line,
@@ -95,7 +95,7 @@ impl Seen {
     }
 
     /// The direction predicted to a time.
-    pub(super) fn at(&self, time: Timestamp) -> Sight {
+    pub(super) fn at(&self, time: Timestamp) -> DirectionFilter {
         let mut sight = self.sight.clone();
         sight.predict(time, TURNING_DENSITY);
         sight
@@ -109,7 +109,7 @@ impl Seen {
         camera: &CameraName,
         (line, time): (&SightLine, Timestamp),
         (speed, max_range_m): (f64, f64),
-        motion: &Motion,
+        motion: &TrackMotion,
     ) -> Option<Track> {
         let Self { sight, line: last, uncertainty, .. } = self;
         let by_now = self.at(time).direction;

@@ -7,13 +7,13 @@ use crossfix_geometry::Geodetic;
 use csv::StringRecord;
 use nalgebra::Point3;
 
-use super::{Above, Place, Row};
+use super::{Above, LogPlace, LogRow};
 
 const LOCAL: [&str; 4] = ["time_s", "east_m", "north_m", "up_m"];
 const GEODETIC: [&str; 4] = ["time_s", "latitude_deg", "longitude_deg", "height_m"];
 
 /// Reads the columns of either form and ignores all others.
-pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
+pub(super) fn read(path: &Path) -> anyhow::Result<Vec<LogRow>> {
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path)?;
     let head = reader.headers()?.clone();
     let columns = |names: [&str; 4]| {
@@ -41,15 +41,19 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
     Ok(rows)
 }
 
-fn csv_row(record: &StringRecord, columns: [usize; 4], is_geodetic: bool) -> anyhow::Result<Row> {
+fn csv_row(
+    record: &StringRecord,
+    columns: [usize; 4],
+    is_geodetic: bool,
+) -> anyhow::Result<LogRow> {
     let number = |column: usize| record.get(column)?.parse::<f64>().ok().filter(|n| n.is_finite());
     let [Some(time_s), Some(x), Some(y), Some(z)] = columns.map(number) else {
         bail!("not four numbers");
     };
     let place = if is_geodetic {
-        Place::Geodetic { place: Geodetic::from_degrees(x, y, z)?, above: Above::Unsaid }
+        LogPlace::Geodetic { place: Geodetic::from_degrees(x, y, z)?, above: Above::Unsaid }
     } else {
-        Place::Local(Point3::new(x, y, z))
+        LogPlace::Local(Point3::new(x, y, z))
     };
-    Ok(Row { time_s, place })
+    Ok(LogRow { time_s, place })
 }

@@ -8,10 +8,10 @@ use anyhow::ensure;
 use crossfix_geometry::Geodetic;
 use time::OffsetDateTime;
 
-use super::{Above, Place, Row};
+use super::{Above, LogPlace, LogRow};
 
 /// The points of all tracks that have a time and a height.
-pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
+pub(super) fn read(path: &Path) -> anyhow::Result<Vec<LogRow>> {
     let file = gpx::read(BufReader::new(File::open(path)?))?;
     let points = file.tracks.iter().flat_map(|track| &track.segments).flat_map(|part| &part.points);
     let (mut rows, mut bare) = (Vec::new(), 0_u64);
@@ -22,11 +22,11 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
         };
         let nanos = OffsetDateTime::from(time).unix_timestamp_nanos();
         let place = Geodetic::from_degrees(point.point().y(), point.point().x(), height)?;
-        let place = Place::Geodetic {
+        let place = LogPlace::Geodetic {
             place,
             above: point.geoidheight.map_or(Above::Unsaid, |geoid_m| Above::Sea(Some(geoid_m))),
         };
-        rows.push(Row { time_s: nanos as f64 * 1e-9, place });
+        rows.push(LogRow { time_s: nanos as f64 * 1e-9, place });
     }
     if bare > 0 {
         tracing::warn!("{}: {bare} points have no time or no height", path.display());

@@ -78,13 +78,13 @@ const GPS_AHEAD_S: f64 = 18.0;
 
 /// One sample as it stands in the file.
 #[derive(Clone, Copy, Debug)]
-struct Row {
+struct LogRow {
     time_s: f64,
-    place: Place,
+    place: LogPlace,
 }
 
 #[derive(Clone, Copy, Debug)]
-enum Place {
+enum LogPlace {
     Local(Point3<f64>),
     /// Degrees, and a height with its zero.
     Geodetic {
@@ -113,17 +113,17 @@ pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
     };
     let wrong = || format!("cannot read the log {}", path.display());
     let rows = rows.with_context(wrong)?;
-    let rows: Vec<Row> = rows
+    let rows: Vec<LogRow> = rows
         .into_iter()
         .map(|row| reading.placed(row))
         .collect::<Result<_, _>>()
         .with_context(wrong)?;
     let frame = reading.anchor.or_else(|| first_place(&rows)).map(LocalFrame::at);
-    let sample = |row: &Row| {
+    let sample = |row: &LogRow| {
         let mut position = match (row.place, &frame) {
-            (Place::Geodetic { place, .. }, Some(frame)) => frame.local(place),
-            (Place::Local(position), _) => position,
-            (Place::Geodetic { .. }, None) => return None,
+            (LogPlace::Geodetic { place, .. }, Some(frame)) => frame.local(place),
+            (LogPlace::Local(position), _) => position,
+            (LogPlace::Geodetic { .. }, None) => return None,
         };
         position.z -= reading.antenna_m;
         let ahead_s = if reading.is_gps_time { GPS_AHEAD_S } else { 0.0 };
@@ -143,12 +143,12 @@ fn begins_with(path: &Path, letter: u8) -> bool {
 
 impl Reading {
     /// A row with its height converted to height above the ellipsoid.
-    fn placed(&self, row: Row) -> anyhow::Result<Row> {
+    fn placed(&self, row: LogRow) -> anyhow::Result<LogRow> {
         ensure!(
             self.geoid_m.is_none() || self.height == LogHeight::Sea,
             "--geoid is of heights above the sea (--height sea)"
         );
-        let Place::Geodetic { place, above } = row.place else {
+        let LogPlace::Geodetic { place, above } = row.place else {
             ensure!(
                 self.height == LogHeight::Ellipsoid,
                 "--height is of a log in degrees: its metres are the site's"
@@ -169,15 +169,15 @@ impl Reading {
         };
         let (latitude, longitude) = (place.latitude_deg(), place.longitude_deg());
         let place = Geodetic::from_degrees(latitude, longitude, place.height() + raise_m)?;
-        Ok(Row { place: Place::Geodetic { place, above: Above::Unsaid }, ..row })
+        Ok(LogRow { place: LogPlace::Geodetic { place, above: Above::Unsaid }, ..row })
     }
 }
 
 /// The position at which a log without an anchor begins; it is also logged.
-fn first_place(rows: &[Row]) -> Option<Geodetic> {
+fn first_place(rows: &[LogRow]) -> Option<Geodetic> {
     let place = rows.iter().find_map(|row| match row.place {
-        Place::Geodetic { place, .. } => Some(place),
-        Place::Local(_) => None,
+        LogPlace::Geodetic { place, .. } => Some(place),
+        LogPlace::Local(_) => None,
     })?;
     tracing::info!(
         "the site's origin is where the log begins, {:.7},{:.7},{:.2} (--anchor says another)",

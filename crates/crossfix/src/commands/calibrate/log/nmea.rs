@@ -9,7 +9,7 @@ use anyhow::{Context, ensure};
 use crossfix_geometry::Geodetic;
 use time::{Date, Month};
 
-use super::{Above, Place, Row};
+use super::{Above, LogPlace, LogRow};
 
 /// Seconds per day.
 const DAY_S: f64 = 86_400.0;
@@ -19,7 +19,7 @@ const CENTURY: i32 = 2000;
 /// Positions of which the receiver was sure (GGA), with dates from other sentences (RMC); a
 /// position and the date nearest to it are less than half a day apart. Other sentences and bytes
 /// are skipped.
-pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
+pub(super) fn read(path: &Path) -> anyhow::Result<Vec<LogRow>> {
     let bytes = std::fs::read(path)?;
     let text = String::from_utf8_lossy(&bytes);
     let (mut places, mut dated_s, mut damaged) = (Vec::new(), None, 0_u64);
@@ -41,7 +41,7 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
         tracing::warn!("{}: {damaged} sentences are damaged", path.display());
     }
     ensure!(!places.is_empty(), "it has no place that the receiver was sure of (GGA)");
-    places.into_iter().map(Found::row).collect()
+    places.into_iter().map(UndatedPosition::row).collect()
 }
 
 /// The fields of a sentence, beginning with its talker and kind.
@@ -89,11 +89,11 @@ impl<'a> Sentence<'a> {
 
     /// A GGA's position. Its fields: time, latitude, longitude, quality, satellites, dilution,
     /// height above the sea, its unit, and height of the sea above the ellipsoid.
-    fn place(&self) -> Option<Found> {
+    fn place(&self) -> Option<UndatedPosition> {
         /// Qualities of a real fix: not dead reckoning, manual input or simulation.
         const SURE: [f64; 5] = [1.0, 2.0, 3.0, 4.0, 5.0];
         SURE.contains(&self.number(6)?).then_some(())?;
-        Some(Found {
+        Some(UndatedPosition {
             of_day_s: self.of_day_s(1)?,
             time_s: None,
             place: [self.degrees(2, ["N", "S"])?, self.degrees(4, ["E", "W"])?, self.number(9)?],
@@ -115,7 +115,7 @@ impl<'a> Sentence<'a> {
 
 /// A position whose day may not be known yet.
 #[derive(Clone, Copy, Debug)]
-struct Found {
+struct UndatedPosition {
     of_day_s: f64,
     time_s: Option<f64>,
     /// Latitude and longitude, degrees, and height above the sea, m.
@@ -123,19 +123,19 @@ struct Found {
     geoid_m: Option<f64>,
 }
 
-impl Found {
-    fn row(self) -> anyhow::Result<Row> {
+impl UndatedPosition {
+    fn row(self) -> anyhow::Result<LogRow> {
         let time_s = self.time_s.context(
             "it has no date: let the receiver send RMC sentences as well, or make columns of it",
         )?;
         let [latitude, longitude, height] = self.place;
         let place = Geodetic::from_degrees(latitude, longitude, height)?;
-        Ok(Row { time_s, place: Place::Geodetic { place, above: Above::Sea(self.geoid_m) } })
+        Ok(LogRow { time_s, place: LogPlace::Geodetic { place, above: Above::Sea(self.geoid_m) } })
     }
 }
 
 /// Gives the newest positions that have no day yet the day that brings them nearest to a moment.
-fn place_in_day(places: &mut [Found], moment_s: f64) {
+fn place_in_day(places: &mut [UndatedPosition], moment_s: f64) {
     for found in places.iter_mut().rev().take_while(|found| found.time_s.is_none()) {
         let days = ((moment_s - found.of_day_s) / DAY_S).round();
         found.time_s = Some(found.of_day_s + days * DAY_S);
