@@ -273,12 +273,16 @@ impl FitEquations {
         let solution = solved.solve(&right);
         let gain = solution[0];
         fit.gain = gain;
-        // Residual sum of squares, r'r - x'J'r with the image r (of x only the gain where the
-        // contrast is given), over the pixels less the fitted parameters.
+        // Residual sum of squares over the pixels less the fitted parameters: with the image r it
+        // is r'r - x'J'r for the x of least squares. A given contrast is not: there it is
+        // r'r - 2 g m'r + g^2 m'm with the model m and the gain g alone.
         let freedoms = if shift_only { 4.0 } else { 6.0 };
         let fitted = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
-        let explained =
-            if options.contrast.is_some() { gain * fitted[0] } else { solution.dot(&fitted) };
+        let explained = if options.contrast.is_some() {
+            gain * (2.0 * fitted[0] - gain * energy)
+        } else {
+            solution.dot(&fitted)
+        };
         fit.residual_variance =
             ((p[5][5] - explained) / (fit.pixels as f64 - freedoms).max(1.0)).max(0.0);
         if gain <= 0.0 || !gain.is_finite() {
@@ -357,6 +361,25 @@ mod tests {
         let fit = Fitter::default().fit(&image, &reference(), 23.0, 16.0, FitOptions::default());
         assert!((fit.x - 23.3).abs() < 0.01 && (fit.y - 15.8).abs() < 0.01, "{fit:?}");
         assert!((fit.gain - 0.7).abs() < 0.01 && fit.residual_variance < 1e-3, "{fit:?}");
+    }
+
+    #[test]
+    fn residuals_of_a_contrast_that_is_given_are_those_of_that_contrast() {
+        let mut image = spot(40, 40, 20.0, 20.0, 1.0, 0.0);
+        image.samples_mut().iter_mut().for_each(|s| *s *= 0.7);
+        let options = FitOptions { contrast: Some(1.0), ..FitOptions::default() };
+        let fit = Fitter::default().fit(&image, &reference(), 13.0, 14.0, options);
+        // By hand: three tenths of the spot are left, but for their mean, inside its edge.
+        let spot: Vec<f64> = (-5..=5)
+            .flat_map(|y| (-6..=6).map(move |x| (f64::from(x), f64::from(y))))
+            .map(|(x, y)| 5.0 * (-x * x / 8.0 - y * y / 5.0).exp())
+            .collect();
+        let (count, mean) = (spot.len() as f64, spot.iter().sum::<f64>() / spot.len() as f64);
+        let energy: f64 = spot.iter().map(|value| (value - mean).powi(2)).sum();
+        let expected = 0.09 * energy / (count - 4.0);
+        // The model is a spline whose filter is cut off at five samples, which changes the model's
+        // energy by half a percent, and these residuals by three times that.
+        assert!((fit.residual_variance / expected - 1.0).abs() < 0.02, "{fit:?}, {expected}");
     }
 
     #[test]

@@ -34,6 +34,9 @@ const RUNNER_UP: f64 = 6.0;
 /// turns again. With more of it a target that changes course leaves the image before the head has
 /// turned; with less the head turns all the time.
 const OFF_MIDDLE: f64 = 0.6;
+/// How long a turn takes, s: while the head turns, the target may be further off by its way in this
+/// time.
+const TURN_S: f64 = 1.0;
 /// A turn by less than this fraction of half the view shows nothing new.
 const LEAST_TURN: f64 = 0.1;
 /// The head aims at most this far ahead, s: targets change course.
@@ -305,7 +308,8 @@ impl Seeker {
         self.search = None;
         let soon = place_at(cue, time.plus_seconds(0.5))?;
         let rate = now.direction.angle(&soon.direction) / 0.5;
-        let may_be_off = OFF_MIDDLE * self.half_view + if is_settled { 0.0 } else { rate };
+        let on_its_way = if is_settled { 0.0 } else { rate * TURN_S };
+        let may_be_off = OFF_MIDDLE * self.half_view + on_its_way;
         if now.direction.angle(&axis(mount, angles)) < may_be_off {
             return None;
         }

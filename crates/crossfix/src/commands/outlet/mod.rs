@@ -30,7 +30,7 @@ use crate::shutdown::{LEAVE, Shutdown};
 const POLL: Duration = Duration::from_millis(20);
 /// Older data are useless to receivers, s: an event of Cursor on Target is valid for this long.
 const STALE_S: f64 = 10.0;
-/// Most events kept for a receiver that is not there: more would be old news.
+/// Most events kept for a receiver that is not there; the oldest are dropped.
 const MOST_EVENTS: usize = 1000;
 
 /// Tell programs of others where the targets are, live.
@@ -229,8 +229,10 @@ impl HeardSince {
                     self.situation.hear_calibration(&calibration);
                 }
             }
-            Channel::Events if self.events.len() < MOST_EVENTS => {
+            Channel::Events => {
                 self.events.extend(decode::<TrackEvent>(&received.data).ok());
+                let too_many = self.events.len().saturating_sub(MOST_EVENTS);
+                self.events.drain(..too_many);
             }
             _ => {}
         }
