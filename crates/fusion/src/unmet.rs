@@ -28,6 +28,9 @@ const LEAST_SHARE: f64 = 0.8;
 const SOMETHING_S: f64 = 1.0;
 /// Exposures further apart than this are not compared, s.
 const MAX_APART_S: f64 = 0.5;
+/// Cameras stand in the same place if their distance is at most this many standard deviations of
+/// their places: what they see has no range then.
+const SIGMAS: f64 = 3.0;
 /// Most lines of one exposure that are compared: time is bounded.
 const MAX_LINES: usize = 30;
 /// Most image tracks of a camera that are remembered: memory is bounded.
@@ -57,6 +60,8 @@ pub enum UnmetLines {
     },
     /// They meet, but not as any target's motion would explain.
     Unsteady,
+    /// They begin in the same place, as far as the poses tell.
+    Together,
 }
 
 impl WhyNothing {
@@ -94,6 +99,9 @@ impl fmt::Display for WhyNothing {
             UnmetLines::Unsteady => {
                 write!(f, "and their lines meet, but not as one target's: check clocks and poses")
             }
+            UnmetLines::Together => {
+                write!(f, "but they stand in the same place: check whether a pose was copied")
+            }
         }
     }
 }
@@ -103,7 +111,44 @@ impl fmt::Display for WhyNothing {
 enum ComparisonResult {
     /// One of the cameras saw nothing.
     Nothing,
+    /// The cameras stand in the same place.
+    Together,
     Lines(Passing),
+}
+
+/// The kinds of results by which a reason is found; of two that are equally frequent, the later.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Nowhere,
+    Apart,
+    Close,
+    Together,
+}
+
+impl Kind {
+    const ALL: [Self; 4] = [Self::Nowhere, Self::Apart, Self::Close, Self::Together];
+
+    fn counter(self) -> &'static str {
+        match self {
+            Self::Nowhere => "unfound_lines_meet_nowhere",
+            Self::Apart => "unfound_lines_miss_each_other",
+            Self::Close => "unfound_lines_meet",
+            Self::Together => "unfound_lines_from_one_place",
+        }
+    }
+}
+
+impl ComparisonResult {
+    /// `None` if one of the cameras saw nothing.
+    fn kind(self) -> Option<Kind> {
+        match self {
+            Self::Nothing => None,
+            Self::Together => Some(Kind::Together),
+            Self::Lines(Passing::Nowhere) => Some(Kind::Nowhere),
+            Self::Lines(Passing::Apart { .. }) => Some(Kind::Apart),
+            Self::Lines(Passing::Close) => Some(Kind::Close),
+        }
+    }
 }
 
 /// What one camera has seen lately.
@@ -120,6 +165,29 @@ struct LatelySeen {
 struct PairComparisons {
     time: Timestamp,
     shown: VecDeque<ComparisonResult>,
+}
+
+impl PairComparisons {
+    /// Whether both cameras have seen something in most comparisons, and these are enough.
+    fn is_steady(&self) -> bool {
+        let both = self.shown.iter().filter(|shown| shown.kind().is_some()).count();
+        self.shown.len() * 2 >= REMEMBERED && both as f64 >= LEAST_SHARE * self.shown.len() as f64
+    }
+
+    fn count(&self, kind: Kind) -> usize {
+        self.shown.iter().filter(|shown| shown.kind() == Some(kind)).count()
+    }
+
+    /// The median distance at which the lines miss each other, m.
+    fn median_miss(&self) -> Option<f64> {
+        let miss = |shown: &ComparisonResult| match shown {
+            ComparisonResult::Lines(Passing::Apart { by_m }) => Some(*by_m),
+            _ => None,
+        };
+        let mut misses: Vec<f64> = self.shown.iter().filter_map(miss).collect();
+        misses.sort_by(f64::total_cmp);
+        misses.get(misses.len() / 2).copied()
+    }
 }
 
 /// Compares cameras while nothing is found.
@@ -180,9 +248,7 @@ impl Unmet {
                 continue;
             }
             let shown = compared(&lines, &seen.lines, &self.passings);
-            if let ComparisonResult::Lines(passing) = shown {
-                counted.push(counter(passing));
-            }
+            counted.extend(shown.kind().map(Kind::counter));
             pair.time = now;
             pair.shown.push_back(shown);
             if pair.shown.len() > REMEMBERED {
@@ -234,47 +300,30 @@ impl Unmet {
     /// What most comparisons of the cameras that see something have shown, and the two cameras that
     /// show it most clearly.
     fn conclusion(&self) -> Option<WhyNothing> {
-        let both = |pair: &PairComparisons| {
-            pair.shown.iter().filter(|shown| matches!(shown, ComparisonResult::Lines(_))).count()
-        };
-        let steady = self.pairs.iter().filter(|(_, pair)| {
-            pair.shown.len() * 2 >= REMEMBERED
-                && both(pair) as f64 >= LEAST_SHARE * pair.shown.len() as f64
-        });
-        let steady: Vec<(&[CameraName; 2], &PairComparisons)> = steady.collect();
-        let kind = |passing: Passing| match passing {
-            Passing::Nowhere => 0,
-            Passing::Apart { .. } => 1,
-            Passing::Close => 2,
-        };
-        let count = |pair: &PairComparisons, wanted: usize| {
-            let lines = pair.shown.iter();
-            lines
-                .filter(|shown| matches!(shown, ComparisonResult::Lines(passing) if kind(*passing) == wanted))
-                .count()
-        };
-        let total = |wanted| steady.iter().map(|(_, pair)| count(pair, wanted)).sum::<usize>();
-        let most = (0..3).filter(|&k| total(k) > 0).max_by_key(|&k| total(k))?;
-        let (cameras, pair) = steady.into_iter().max_by_key(|(_, pair)| count(pair, most))?;
+        let steady: Vec<(&[CameraName; 2], &PairComparisons)> =
+            self.pairs.iter().filter(|(_, pair)| pair.is_steady()).collect();
+        let total = |kind: &Kind| steady.iter().map(|(_, pair)| pair.count(*kind)).sum::<usize>();
+        let most = Kind::ALL.into_iter().filter(|kind| total(kind) > 0).max_by_key(total)?;
+        let (cameras, pair) = steady.into_iter().max_by_key(|(_, pair)| pair.count(most))?;
         let lines = match most {
-            0 => UnmetLines::Nowhere { max_range_m: self.max_range_m },
-            1 => UnmetLines::Apart { by_m: median_miss(pair)? },
-            _ => UnmetLines::Unsteady,
+            Kind::Nowhere => UnmetLines::Nowhere { max_range_m: self.max_range_m },
+            Kind::Apart => UnmetLines::Apart { by_m: pair.median_miss()? },
+            Kind::Close => UnmetLines::Unsteady,
+            Kind::Together => UnmetLines::Together,
         };
         Some(WhyNothing { cameras: cameras.clone(), lines })
     }
 }
 
-fn counter(passing: Passing) -> &'static str {
-    match passing {
-        Passing::Nowhere => "unfound_lines_meet_nowhere",
-        Passing::Apart { .. } => "unfound_lines_miss_each_other",
-        Passing::Close => "unfound_lines_meet",
-    }
-}
-
 /// What the two closest lines of two cameras do.
 fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> ComparisonResult {
+    let (Some(first), Some(second)) = (one.first(), other.first()) else {
+        return ComparisonResult::Nothing;
+    };
+    let unsure_m = first.origin_sd_m + second.origin_sd_m;
+    if (first.line.origin - second.line.origin).norm() <= SIGMAS * unsure_m {
+        return ComparisonResult::Together;
+    }
     let all = one.iter().flat_map(|first| other.iter().map(|second| passings.of(first, second)));
     let closeness = |passing: &Passing| match passing {
         Passing::Close => f64::NEG_INFINITY,
@@ -283,15 +332,4 @@ fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> Comp
     };
     let closest = all.min_by(|a, b| closeness(a).total_cmp(&closeness(b)));
     closest.map_or(ComparisonResult::Nothing, ComparisonResult::Lines)
-}
-
-/// The median distance at which two cameras' lines miss each other, m.
-fn median_miss(pair: &PairComparisons) -> Option<f64> {
-    let miss = |shown: &ComparisonResult| match shown {
-        ComparisonResult::Lines(Passing::Apart { by_m }) => Some(*by_m),
-        _ => None,
-    };
-    let mut misses: Vec<f64> = pair.shown.iter().filter_map(miss).collect();
-    misses.sort_by(f64::total_cmp);
-    misses.get(misses.len() / 2).copied()
 }

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Scene, found, fusion_of, site, straight};
+use common::{Eye, Scene, found, fusion_of, site, straight};
 use crossfix_fusion::{Fusion, FusionConfig, UnmetLines};
 use crossfix_message::BearingFrame;
 use nalgebra::{Rotation3, Vector3};
@@ -106,4 +106,19 @@ fn clutter_is_not_something() {
         }
     });
     assert_eq!(when, None);
+}
+
+#[test]
+fn cameras_whose_poses_are_copies_are_said() {
+    let scene = two_cameras();
+    // Both see the target from where they are, but the fusion centre is told one place for both.
+    let [first, second] = [&scene.eyes[0], &scene.eyes[1]].map(Eye::clone);
+    let told = [first.clone(), Eye { name: second.name, ..first }];
+    let mut fusion = fusion_of(FusionConfig::default(), &told);
+    for frame in scene.frames(3) {
+        fusion.ingest(&frame);
+    }
+    let why = fusion.why_nothing().unwrap();
+    assert_eq!(why.lines, UnmetLines::Together);
+    assert!(why.to_string().ends_with("check whether a pose was copied"), "{why}");
 }

@@ -48,8 +48,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let fusion = args.config.as_deref().map(|path| path.join(FUSION)).filter(|file| file.is_file());
     let recalibration = calibration.as_deref().map(Recalibration::load).transpose()?;
     let seen = watched(&args.recording, recalibration, fusion.as_deref())?;
-    let figures: Vec<CheckedCamera> =
-        seen.iter().map(|(name, seen)| CheckedCamera::of(name, seen)).collect();
+    let figures: Vec<WatchedCamera> =
+        seen.iter().map(|(name, seen)| WatchedCamera::of(name, seen)).collect();
     if args.json {
         output::json(&figures)?;
     } else {
@@ -204,7 +204,7 @@ enum CameraVerdict {
 }
 
 #[derive(Debug, Serialize)]
-struct CheckedCamera {
+struct WatchedCamera {
     name: String,
     verdict: CameraVerdict,
     /// The longest time that it was watched together with others within about a minute, s.
@@ -219,7 +219,7 @@ struct CheckedCamera {
     why: String,
 }
 
-impl CheckedCamera {
+impl WatchedCamera {
     fn of(name: &CameraName, seen: &CameraRecord) -> Self {
         let watched_s = seen.watch.as_ref().map_or(0.0, |watch| watch.watched_s);
         let moved_at =
@@ -259,7 +259,7 @@ impl CheckedCamera {
     }
 }
 
-fn render(figures: &[CheckedCamera]) -> String {
+fn render(figures: &[WatchedCamera]) -> String {
     let head = ["camera", "watched [s]", "turned by [mrad]", "SD [mrad]", "evidence", "verdict"];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     for camera in figures {
