@@ -25,20 +25,25 @@
 //! started, as `crossfix` does by the variable `ZENOH_RUNTIME`.
 
 mod config;
+mod error;
 mod link;
 mod origin;
 mod presence;
+mod publisher;
 mod reception;
 mod security;
+mod session_config;
 mod subscription;
 
 pub use config::{Anchor, Area, Mode, NetworkConfig, NetworkError, Role, address, host_of};
-pub use link::{AliveToken, Delivery, Link, LinkError, LinkPublisher, OwnCertificate};
+pub use error::LinkError;
+pub use link::Link;
 pub use origin::{Origin, RunId};
 pub use presence::Presence;
+pub use publisher::{AliveToken, Delivery, LinkPublisher};
 pub use reception::Reception;
 pub use security::{
     AUTHORITY_FILE, Authority, AuthorityError, Credentials, CredentialsError, HandshakeError,
-    Identity, IdentityError, Issued, Security, Validity, connect, handshake,
+    Identity, IdentityError, Issued, OwnCertificate, Security, Validity, connect, handshake,
 };
 pub use subscription::{Received, Refused, Subscription};

@@ -14,6 +14,7 @@ mod authority;
 mod credentials;
 mod handshake;
 mod identity;
+mod shown;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -22,10 +23,11 @@ use serde::{Deserialize, Serialize};
 
 pub(crate) use access::access_control;
 pub use authority::{Authority, AuthorityError, Issued};
-pub(crate) use credentials::days;
 pub use credentials::{Credentials, CredentialsError, Validity};
 pub use handshake::{HandshakeError, connect, handshake};
 pub use identity::{Identity, IdentityError};
+pub use shown::OwnCertificate;
+pub(crate) use shown::own_certificate;
 
 /// `[security]` of a network file: the site's links are encrypted, and both ends of each link show
 /// who they are. `crossfix enroll` makes the certificates and adds this section.
