@@ -166,24 +166,30 @@ impl Tracker {
                 && track.others_than(&exposure.camera, &self.motion) >= 2
                 && known.expects(track.position_at(exposure.time), self.max_range_m)
         });
-        let origin = known.camera.pose().position();
-        let nearest = |track: &Track| {
-            let camera = (&exposure.camera, origin);
-            let expected =
-                track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
-            let fits = exposure.sightings.iter().enumerate();
-            let fits = fits
-                .filter_map(|(i, s)| Some((expected.fit(&s.line, self.gate)?.gate_distance, i)));
-            fits.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, nearest)| nearest)
-        };
         let (mut fittings, mut used) = (Fittings::default(), Vec::new());
         for track in seen {
-            let nearest = nearest(track);
+            let nearest = self.nearest_sighting(track, exposure, known);
             let others = track.others_than(&exposure.camera, &self.motion);
             fittings.add(others, fitting(track, exposure, known, nearest.is_some()));
             used.extend(nearest.map(|nearest| (nearest, track.id)));
         }
         (fittings, used)
+    }
+
+    /// The index of the bearing of an exposure that fits a track best.
+    fn nearest_sighting(
+        &self,
+        track: &Track,
+        exposure: &Exposure,
+        known: &KnownCamera,
+    ) -> Option<usize> {
+        let camera = (&exposure.camera, known.camera.pose().position());
+        let expected =
+            track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
+        let fits = exposure.sightings.iter().enumerate();
+        let fits =
+            fits.filter_map(|(i, s)| Some((expected.fit(&s.line, self.gate)?.gate_distance, i)));
+        fits.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, nearest)| nearest)
     }
 
     /// How targets move.

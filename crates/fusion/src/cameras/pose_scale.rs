@@ -188,15 +188,26 @@ impl Cameras {
         let spread = information.try_inverse()?;
         let place = spread * pull;
         let of_camera = |(sample, weight): (&ScaleSample, &Matrix2<f64>)| {
-            let ScaleSample { offset, by_position, pose, .. } = sample;
-            // With pose root L and factor s: found s |L' W (z - A x)|^2, expected s tr(L' P L).
-            let error = pose.transpose() * weight * (offset - by_position * place);
-            let told = weight - weight * by_position * spread * by_position.transpose() * weight;
-            (
-                error.norm_squared() * scale(sample),
-                (pose.transpose() * told * pose).trace() * scale(sample),
-            )
+            let (found, expected) = sample.found_and_expected(weight, &place, &spread);
+            (found * scale(sample), expected * scale(sample))
         };
         Some(samples.iter().zip(&weights).map(of_camera).collect())
+    }
+}
+
+impl ScaleSample {
+    /// As [`Cameras::found_and_expected`], for one camera with a factor of 1, given the best place
+    /// and its covariance.
+    fn found_and_expected(
+        &self,
+        weight: &Matrix2<f64>,
+        place: &Vector3<f64>,
+        spread: &Matrix3<f64>,
+    ) -> (f64, f64) {
+        let Self { offset, by_position, pose, .. } = self;
+        // With pose root L and factor s: found s |L' W (z - A x)|^2, expected s tr(L' P L).
+        let error = pose.transpose() * weight * (offset - by_position * place);
+        let told = weight - weight * by_position * spread * by_position.transpose() * weight;
+        (error.norm_squared(), (pose.transpose() * told * pose).trace())
     }
 }

@@ -376,19 +376,7 @@ impl Belief {
             0 => self.common.variance,
             _ => self.shares().map(|(clock, share)| share.powi(2) * clock.drift_prior).sum(),
         };
-        // Row vector h of x_clock - sum_k share_k x_k over the state, where the offset `ahead`
-        // seconds later is offset + ahead * drift.
-        let mut row: BTreeMap<usize, f64> = BTreeMap::new();
-        let mut put = |clock: &ClockEntry, weight: f64| {
-            if let Some(place) = clock.place.filter(|_| weight != 0.0) {
-                *row.entry(place + component).or_default() += weight;
-                if component == 0 {
-                    *row.entry(place + 1).or_default() += weight * ahead;
-                }
-            }
-        };
-        put(clock, 1.0);
-        self.shares().for_each(|(other, share)| put(other, -share));
+        let row = self.absolute_row(clock, component, ahead);
         let site = if component == 0 { self.site[0] + self.site[1] * ahead } else { self.site[1] };
         let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum::<f64>() + site;
         // Variance: h P h'.
@@ -397,6 +385,26 @@ impl Belief {
         };
         let variance: f64 = row.iter().map(along).sum();
         (mean, variance.max(0.0), common)
+    }
+
+    /// Row vector h of x_clock - sum_k share_k x_k over the state, where the offset `ahead` seconds
+    /// later is offset + ahead * drift.
+    fn absolute_row(
+        &self,
+        clock: &ClockEntry,
+        component: usize,
+        ahead: f64,
+    ) -> BTreeMap<usize, f64> {
+        let mut row: BTreeMap<usize, f64> = BTreeMap::new();
+        let others = self.shares().map(|(other, share)| (other, -share));
+        for (clock, weight) in std::iter::once((clock, 1.0)).chain(others) {
+            let Some(place) = clock.place.filter(|_| weight != 0.0) else { continue };
+            *row.entry(place + component).or_default() += weight;
+            if component == 0 {
+                *row.entry(place + 1).or_default() += weight * ahead;
+            }
+        }
+        row
     }
 
     /// The estimate of a camera's clock at a time.

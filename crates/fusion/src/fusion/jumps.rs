@@ -84,22 +84,18 @@ impl Fusion {
     /// it.
     fn has_stepped(&self, frames: &[BearingFrame], step_s: f64) -> bool {
         let fit = |ahead_s: f64| -> f64 {
-            let of_frame = |frame: &BearingFrame| {
-                let frame = moved(frame, -ahead_s);
-                let name = frame.camera.parse().ok()?;
-                let known = self.cameras.at(&name, Timestamp::from_nanos(frame.capture_time_ns))?;
-                let read = ingress::read(
-                    &frame,
-                    &name,
-                    known,
-                    &self.config.bearings,
-                    &mut Counters::default(),
-                );
-                Some(self.tracker.fit(&read.ok()?.0, known))
-            };
-            frames.iter().filter_map(of_frame).sum()
+            frames.iter().filter_map(|frame| self.fit_of_frame(&moved(frame, -ahead_s))).sum()
         };
         step_s < 0.0 || (step_s < LONGEST_FORWARD_S && fit(step_s) > fit(0.0) + STEP_MARGIN)
+    }
+
+    /// How well a frame fits the tracks; `None` if it would be refused.
+    fn fit_of_frame(&self, frame: &BearingFrame) -> Option<f64> {
+        let name = frame.camera.parse().ok()?;
+        let known = self.cameras.at(&name, Timestamp::from_nanos(frame.capture_time_ns))?;
+        let read =
+            ingress::read(frame, &name, known, &self.config.bearings, &mut Counters::default());
+        Some(self.tracker.fit(&read.ok()?.0, known))
     }
 
     /// Applies a step of all clocks: the tracks continue on the new time.

@@ -226,27 +226,10 @@ impl Hypotheses {
         let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
         near.retain(|(ratio, _)| *ratio > miss && *ratio > best - RIVAL_MARGIN);
         near.truncate(MAX_BRANCHES);
-        let density = motion.density(hypothesis.track.model_probabilities());
-        let taken = |mut child: Hypothesis, (ratio, i): (f64, usize)| {
-            let (id, line) = &lines[i];
-            let time = (exposure.time, &uncertainty);
-            child.track.measurement_update(&exposure.camera, &line.line, time, motion)?;
-            child.track.score += ratio;
-            child.track.look(&exposure.camera, exposure.time, true, detection, motion);
-            if let Some(TrackExpectation::Near(prediction)) = &prediction {
-                child.one_target.see(
-                    &exposure.camera,
-                    (&line.line, exposure.time, exposure.uncertainty.time_sd_s),
-                    prediction,
-                    (density, self.speed),
-                    ratio,
-                );
-            }
-            child.lines.push((self.period, id.clone()));
-            Some(child)
-        };
         let before = next.len();
-        next.extend(near.into_iter().filter_map(|way| taken(hypothesis.clone(), way)));
+        next.extend(near.into_iter().filter_map(|way| {
+            self.continued_with(way, hypothesis.clone(), context, prediction.as_ref())
+        }));
         if miss <= best - RIVAL_MARGIN && next.len() > before {
             return;
         }
@@ -256,6 +239,34 @@ impl Hypotheses {
             hypothesis.one_target.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
         }
         next.push(hypothesis);
+    }
+
+    /// A hypothesis continued with a bearing, given by its log-likelihood ratio and its index.
+    fn continued_with(
+        &self,
+        (ratio, i): (f64, usize),
+        mut hypothesis: Hypothesis,
+        context: &HypothesisContext<'_>,
+        prediction: Option<&TrackExpectation>,
+    ) -> Option<Hypothesis> {
+        let HypothesisContext { exposure, motion, lines, uncertainty, detection, .. } = *context;
+        let (id, line) = &lines[i];
+        let time = (exposure.time, &uncertainty);
+        let density = motion.density(hypothesis.track.model_probabilities());
+        hypothesis.track.measurement_update(&exposure.camera, &line.line, time, motion)?;
+        hypothesis.track.score += ratio;
+        hypothesis.track.look(&exposure.camera, exposure.time, true, detection, motion);
+        if let Some(TrackExpectation::Near(prediction)) = prediction {
+            hypothesis.one_target.see(
+                &exposure.camera,
+                (&line.line, exposure.time, exposure.uncertainty.time_sd_s),
+                prediction,
+                (density, self.speed),
+                ratio,
+            );
+        }
+        hypothesis.lines.push((self.period, id.clone()));
+        Some(hypothesis)
     }
 
     /// Keeps the best hypotheses of each tree.

@@ -110,19 +110,27 @@ impl Likenesses {
         own: Own,
         now: Timestamp,
     ) -> impl Iterator<Item = NeighbourTrack> + '_ {
-        let is_sure = move |(said, likeness): &(NeighbourTrack, &TrackLikeness)| {
-            let is_rival = |other: &TrackLikeness| {
-                other.is_of_late(now) && other.cost < likeness.cost + 2.0 * CLEARLY.ln()
-            };
-            let mut of_neighbour = self.of_own(own).filter(|(other, _)| other.0 == said.0);
-            let mut of_said = self.0.iter().filter(|((_, other), _)| other == said);
-            likeness.is_of_late(now)
-                && likeness.has_lasted()
-                && likeness.is_likely()
-                && !of_neighbour.any(|(other, likeness)| other != *said && is_rival(likeness))
-                && !of_said.any(|((other, _), likeness)| *other != own && is_rival(likeness))
+        self.of_own(own)
+            .filter(move |(said, likeness)| self.is_sure((own, *said), likeness, now))
+            .map(|(said, _)| said)
+    }
+
+    fn is_sure(
+        &self,
+        (own, said): (Own, NeighbourTrack),
+        likeness: &TrackLikeness,
+        now: Timestamp,
+    ) -> bool {
+        let is_rival = |other: &TrackLikeness| {
+            other.is_of_late(now) && other.cost < likeness.cost + 2.0 * CLEARLY.ln()
         };
-        self.of_own(own).filter(is_sure).map(|(said, _)| said)
+        let mut of_neighbour = self.of_own(own).filter(|(other, _)| other.0 == said.0);
+        let mut of_said = self.0.iter().filter(|((_, other), _)| *other == said);
+        likeness.is_of_late(now)
+            && likeness.has_lasted()
+            && likeness.is_likely()
+            && !of_neighbour.any(|(other, likeness)| other != said && is_rival(likeness))
+            && !of_said.any(|((other, _), likeness)| *other != own && is_rival(likeness))
     }
 
     /// Whether a track here may be one of the neighbours'.

@@ -356,14 +356,8 @@ impl Track {
             parts.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
             parts.iter().sum()
         };
-        let square = |(name, ties): (&CameraName, &Ties)| {
-            let mut considered = ties.covariance;
-            if self.learnt.row_of(name).is_some() {
-                considered.fixed_columns_mut::<2>(LASTING).fill(0.0);
-            }
-            considered * considered.transpose()
-        };
-        let considered = sum(self.ties.iter().map(square).collect());
+        let of_cameras = self.ties.iter().map(|(name, ties)| self.considered_part(name, ties));
+        let considered = sum(of_cameras.collect());
         match self.learnt_part() {
             Some(learnt) => considered + learnt,
             None => {
@@ -371,6 +365,15 @@ impl Track {
                 sum(self.ties.values().map(|t| t.covariance * t.covariance.transpose()).collect())
             }
         }
+    }
+
+    /// The part that a camera's errors cause that are considered and not learnt.
+    fn considered_part(&self, camera: &CameraName, ties: &Ties) -> Matrix6<f64> {
+        let mut considered = ties.covariance;
+        if self.learnt.row_of(camera).is_some() {
+            considered.fixed_columns_mut::<2>(LASTING).fill(0.0);
+        }
+        considered * considered.transpose()
     }
 
     /// The part that the learnt errors cause beyond the considered ones; `None` if their covariance
