@@ -118,23 +118,26 @@ impl ImageTracker {
     /// The candidate that stands in for a lost target: the one that did before, or one that stands
     /// in for no other target.
     fn stand_in_of(&self, lost: &Followed, time: Timestamp) -> Option<ImageTrackId> {
-        let [width, height] = lost.target.size();
-        let fits = |followed: &Followed| {
-            let [w, h] = followed.target.size();
-            let larger = ((w * h) / (width * height)).sqrt();
-            followed.is_candidate()
-                && followed.has_moved()
-                && followed.target.is_seen()
-                && time.seconds_since(followed.since) > CANDIDATE_S
-                && (1.0 / STAND_IN_SIZES..=STAND_IN_SIZES).contains(&larger)
-                && self.followed.iter().all(|other| other.stand_in != Some(followed.id))
-        };
         let is_before = |followed: &&Followed| Some(followed.id) == lost.stand_in;
         let before =
             self.followed.iter().find(is_before).filter(|before| !before.target.is_searching());
         before
-            .or_else(|| self.followed.iter().find(|followed| fits(followed)))
+            .or_else(|| {
+                self.followed.iter().find(|followed| self.may_stand_in(followed, lost, time))
+            })
             .map(|followed| followed.id)
+    }
+
+    fn may_stand_in(&self, followed: &Followed, lost: &Followed, time: Timestamp) -> bool {
+        let [width, height] = lost.target.size();
+        let [w, h] = followed.target.size();
+        let larger = ((w * h) / (width * height)).sqrt();
+        followed.is_candidate()
+            && followed.has_moved()
+            && followed.target.is_seen()
+            && time.seconds_since(followed.since) > CANDIDATE_S
+            && (1.0 / STAND_IN_SIZES..=STAND_IN_SIZES).contains(&larger)
+            && self.followed.iter().all(|other| other.stand_in != Some(followed.id))
     }
 
     /// The box of the target that somebody meant by a given box.

@@ -135,21 +135,16 @@ impl Identity {
             noise: f64::from(state.noise),
         };
         let longest = placed.reference.width().max(placed.reference.height()) as f64;
-        let lost_since = self.probation.as_ref().map(|probation| probation.picture);
         let Scratch { buffers, comparison, .. } = scratch;
         comparison.take(frame.image, placed, &mut buffers.resampler);
         let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
         let speed = self.speed_px_s.max(self.least_speed(state, frame, place));
         let mut against = |picture: &ScenePicture, then: ImagePoint| {
-            let seen = self.in_pictures.iter().find(|(number, _)| *number == picture.number());
-            let seen = seen.map(|(_, seen)| *seen);
-            let was_lost =
-                state.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
+            let seen = self.place_in(picture);
             let has_moved_on = speed * picture.age_s() > longest;
-            if seen.is_none() && !(was_lost && has_moved_on) {
-                return None;
-            }
-            comparison.with(picture, then, seen, placed, &mut buffers.resampler)
+            let tells = seen.is_some() || (self.was_lost(state, picture) && has_moved_on);
+            let resampler = &mut buffers.resampler;
+            tells.then(|| comparison.with(picture, then, seen, placed, resampler)).flatten()
         };
         let pictures = || frame.scene.pictures();
         let scene = pictures().find_map(|picture| against(picture, picture.then(place)));
@@ -159,6 +154,17 @@ impl Identity {
         let lens = turned.find_map(|picture| against(picture, place));
         let scene = scene.map_or(0.0, |arrival| arrival.log_ratio(usual));
         lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(usual)))
+    }
+
+    fn place_in(&self, picture: &ScenePicture) -> Option<ImagePoint> {
+        let mut seen = self.in_pictures.iter();
+        seen.find(|(number, _)| *number == picture.number()).map(|(_, seen)| *seen)
+    }
+
+    /// Whether the target may have been lost when a picture of the scene was taken.
+    fn was_lost(&self, state: &BeliefState, picture: &ScenePicture) -> bool {
+        let lost_since = self.probation.as_ref().map(|probation| probation.picture);
+        state.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest)
     }
 
     /// Least speed with which a lost target can have come to a place by now, px/s.

@@ -129,16 +129,10 @@ impl PaperTarget {
             if config.paper.sub_pixel { peak.refined(&scratch.ratios) } else { peak.whole() };
         let reference = self.reference.image();
         let (width, height) = (reference.width(), reference.height());
-        let whole = |at: f64, gate: usize, reference: usize| {
-            // Circular correlation: placed more than half a gate from the middle, the reference
-            // comes in on the other side.
-            let off = at - (gate as f64 - reference as f64) / 2.0;
-            let wraps = extent == Extent::Circular && off > gate as f64 / 2.0;
-            at + (reference as f64 - 1.0) / 2.0 - if wraps { gate as f64 } else { 0.0 }
-        };
+        let (across, down) = (scratch.gate.width(), scratch.gate.height());
         let place = ImagePoint {
-            x: start[0] + whole(refined.x, scratch.gate.width(), width) + self.middle[0],
-            y: start[1] + whole(refined.y, scratch.gate.height(), height) + self.middle[1],
+            x: start[0] + reference_middle(refined.x, width, across, extent) + self.middle[0],
+            y: start[1] + reference_middle(refined.y, height, down, extent) + self.middle[1],
         };
         let nis = if let Some([x, y]) = &mut self.axes {
             let innovations = [
@@ -169,6 +163,15 @@ fn predict(axes: &mut [AxisFilter; 2], interval: f64, image: &Plane) {
             axis.hold_at(axis.position().clamp(0.0, edge));
         }
     }
+}
+
+/// Where on an axis of the gate the middle of a reference is that is placed at `at`, px.
+fn reference_middle(at: f64, reference: usize, gate: usize, extent: Extent) -> f64 {
+    // Circular correlation: placed more than half a gate from the middle, the reference comes in on
+    // the other side.
+    let off = at - (gate as f64 - reference as f64) / 2.0;
+    let wraps = extent == Extent::Circular && off > gate as f64 / 2.0;
+    at + (reference as f64 - 1.0) / 2.0 - if wraps { gate as f64 } else { 0.0 }
 }
 
 /// The part of an image about a place, cut at whole pixels, and where its first pixel is.

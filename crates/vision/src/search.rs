@@ -385,42 +385,24 @@ impl SearchArea {
         scratch: &mut Scratch,
         config: &TrackerConfig,
     ) -> Best {
-        let Self { ranges, predicted, half, sides, coarseness, is_change } = self;
-        let (sides, coarseness) = (*sides, *coarseness);
-        let side = coarseness as f64;
-        let middle = |index: usize| index as f64 * side + (side - 1.0) / 2.0;
+        let Self { ranges, predicted, half, sides, coarseness, .. } = self;
         // Prior: p = (1 - a) N(place; predicted, variances) + a / area, a the share that is
         // anywhere.
         let variances = state.motion.found().map(|found| found.variance);
         let density = 1.0 / (std::f64::consts::TAU * (variances[0] * variances[1]).sqrt());
         let anywhere = state.anywhere(config);
         let flat = anywhere / ((2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0));
-        let background_at = |column: usize, row: usize| -> f32 {
-            if *is_change {
-                return 0.0;
-            }
-            let (Some(background), Some(seen)) = (&memory.background, state.in_snapshot) else {
-                return 0.0;
-            };
-            let near = (middle(column) - seen.x).abs() <= sides[0] as f64
-                && (middle(row) - seen.y).abs() <= sides[1] as f64;
-            if near {
-                0.0
-            } else {
-                background.ratios.clamped(column as isize, row as isize).max(0.0)
-            }
-        };
         let (mut best, mut most) = ([0, 0], f64::NEG_INFINITY);
         for (y, row) in ranges[1].clone().enumerate() {
-            let across = (middle(row) - predicted[1]).powi(2) / variances[1];
+            let across = (self.middle(row) - predicted[1]).powi(2) / variances[1];
             for (x, column) in ranges[0].clone().enumerate() {
                 let ratio = &mut scratch.ratios.row_mut(y)[x];
-                *ratio -= background_at(column, row);
+                *ratio -= self.background_at(column, row, state, memory);
                 // If even the largest prior does not reach the best, the logarithm is spared.
                 if f64::from(*ratio) + (density + flat).ln() <= most {
                     continue;
                 }
-                let along = (middle(column) - predicted[0]).powi(2) / variances[0];
+                let along = (self.middle(column) - predicted[0]).powi(2) / variances[0];
                 let prior = (1.0 - anywhere) * density * (-0.5 * (along + across)).exp() + flat;
                 let score = f64::from(*ratio) + prior.ln();
                 if score > most {
@@ -440,9 +422,35 @@ impl SearchArea {
         }
         let (column, row) = (ranges[0].start + best[0], ranges[1].start + best[1]);
         Best {
-            place: [middle(column), middle(row)],
+            place: [self.middle(column), self.middle(row)],
             margin: scratch.ratios.row(best[1])[best[0]] - rival,
-            background: background_at(column, row),
+            background: self.background_at(column, row, state, memory),
         }
+    }
+
+    /// Log likelihood ratio that the scene itself had at a place of the coarse picture; 0 where the
+    /// target hid it, and where nothing is known of it.
+    fn background_at(
+        &self,
+        column: usize,
+        row: usize,
+        state: &BeliefState,
+        memory: &SearchMemory,
+    ) -> f32 {
+        if self.is_change {
+            return 0.0;
+        }
+        let (Some(background), Some(seen)) = (&memory.background, state.in_snapshot) else {
+            return 0.0;
+        };
+        let near = (self.middle(column) - seen.x).abs() <= self.sides[0] as f64
+            && (self.middle(row) - seen.y).abs() <= self.sides[1] as f64;
+        if near { 0.0 } else { background.ratios.clamped(column as isize, row as isize).max(0.0) }
+    }
+
+    /// The middle of a column or row of the coarse picture, px of the full picture.
+    fn middle(&self, index: usize) -> f64 {
+        let side = self.coarseness as f64;
+        index as f64 * side + (side - 1.0) / 2.0
     }
 }

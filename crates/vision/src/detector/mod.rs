@@ -260,14 +260,7 @@ impl Detector {
         // The odds to beat: chances per minute over the false tracks that are allowed per minute.
         let asked = (chances / self.config.false_tracks_a_minute).ln() + NOT_INDEPENDENT;
         let sway_px = self.levels[0].sway_px();
-        let is_found = |candidate: &Candidate| {
-            let moved = SWAYS * sway_px
-                + PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
-            candidate.plots >= LEAST_PLOTS
-                && candidate.gone_px > moved
-                && candidate.log_ratio() > asked
-        };
-        let found = self.candidates.take_if(is_found);
+        let found = self.candidates.take_if(|candidate| is_found(candidate, sway_px, asked));
         let found = found.iter().map(|candidate| Found {
             place: outline::outline(image, &candidate.plot),
             gone_px: candidate.gone_px,
@@ -276,6 +269,14 @@ impl Detector {
             .filter(|found| !known.iter().any(|known| overlap(&known.place, &found.place)))
             .collect()
     }
+}
+
+/// Whether a candidate is found: it has gone farther than the scene sways, and a target is likelier
+/// than chance by the log-likelihood ratio that is asked.
+fn is_found(candidate: &Candidate, sway_px: f64, asked: f64) -> bool {
+    let moved =
+        SWAYS * sway_px + PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
+    candidate.plots >= LEAST_PLOTS && candidate.gone_px > moved && candidate.log_ratio() > asked
 }
 
 /// By how much a place stands out on a scale, computed from the finest scale's means.
