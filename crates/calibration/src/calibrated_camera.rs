@@ -182,25 +182,25 @@ impl ClockCorrection {
     /// The correction at one of its times, and the standard deviation, s.
     pub fn at(&self, own_s: f64) -> (f64, f64) {
         let after = self.knots_s.partition_point(|knot| knot[0] <= own_s);
-        let beyond = |knot: &[f64; 3]| {
-            let away = own_s - knot[0];
-            // Beyond the knots: the end's variance, the rate's times away^2, and the random walk's
-            // times |away|.
-            let variance = knot[2].powi(2)
-                + (self.rate_sd * away).powi(2)
-                + self.wander_s.powi(2) * away.abs();
-            (knot[1] + self.rate * away, variance.sqrt())
-        };
         match (after.checked_sub(1).and_then(|k| self.knots_s.get(k)), self.knots_s.get(after)) {
             (Some(before), Some(next)) => {
                 let share = (own_s - before[0]) / (next[0] - before[0]);
                 let between = |k: usize| before[k] + (next[k] - before[k]) * share;
                 (between(1), between(2))
             }
-            (Some(last), None) => beyond(last),
-            (None, Some(first)) => beyond(first),
+            (Some(last), None) => self.beyond(last, own_s),
+            (None, Some(first)) => self.beyond(first, own_s),
             (None, None) => (0.0, 0.0),
         }
+    }
+
+    fn beyond(&self, knot: &[f64; 3], own_s: f64) -> (f64, f64) {
+        let away = own_s - knot[0];
+        // Beyond the knots: the end's variance, the rate's times away^2, and the random walk's
+        // times |away|.
+        let variance =
+            knot[2].powi(2) + (self.rate_sd * away).powi(2) + self.wander_s.powi(2) * away.abs();
+        (knot[1] + self.rate * away, variance.sqrt())
     }
 
     pub(crate) fn is_possible(&self) -> bool {

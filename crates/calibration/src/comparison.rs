@@ -173,22 +173,23 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
 /// The pixels that both calibrations have a direction for.
 fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<ComparedPixel> {
     let size = one.camera.model().intrinsics().size;
-    let direction = |camera: &CalibratedCamera, pixel: Pixel| {
+    grid(size).filter_map(|pixel| sight(one, other, pixel)).collect()
+}
+
+fn sight(one: &CalibratedCamera, other: &CalibratedCamera, pixel: Pixel) -> Option<ComparedPixel> {
+    let direction = |camera: &CalibratedCamera| {
         let own = camera.camera.model().direction(pixel).ok()?;
         Some(Unit::new_normalize(camera.camera.pose().rotation() * own.into_inner()))
     };
-    let said = |camera: &CalibratedCamera, pixel| camera.pointing_sd_rad(pixel, one.range_m);
-    let sight = |pixel| {
-        let target = direction(one, pixel)?.into_inner() * one.range_m;
-        Some(ComparedPixel {
-            pixel,
-            target: one.camera.pose().position() + target,
-            from: other.camera.pose().position(),
-            direction: direction(other, pixel)?,
-            said_rad: said(one, pixel)?.hypot(said(other, pixel)?).max(LEAST_SAID_RAD),
-        })
-    };
-    grid(size).filter_map(sight).collect()
+    let said = |camera: &CalibratedCamera| camera.pointing_sd_rad(pixel, one.range_m);
+    let target = direction(one)?.into_inner() * one.range_m;
+    Some(ComparedPixel {
+        pixel,
+        target: one.camera.pose().position() + target,
+        from: other.camera.pose().position(),
+        direction: direction(other)?,
+        said_rad: said(one)?.hypot(said(other)?).max(LEAST_SAID_RAD),
+    })
 }
 
 /// The similarity that brings the first's targets nearest to the second's lines of sight, in

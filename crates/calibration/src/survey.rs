@@ -130,22 +130,24 @@ impl Survey {
     /// Number of landmarks that tell these cameras where they are: those that two of them see, and
     /// those of a camera that sees enough for its pose.
     pub(crate) fn telling_landmarks(&self, cameras: &[&CameraName]) -> usize {
-        let seen = |camera: &CameraName| {
-            let in_picture = |landmark: &SurveyedLandmark| {
-                landmark.clicks.iter().any(|click| click.camera == *camera)
-            };
-            self.placed_landmarks().filter(|(landmark, _)| in_picture(landmark)).count()
+        self.placed_landmarks().filter(|(landmark, _)| self.tells(landmark, cameras)).count()
+    }
+
+    fn tells(&self, landmark: &SurveyedLandmark, cameras: &[&CameraName]) -> bool {
+        let by: Vec<&CameraName> = landmark
+            .clicks
+            .iter()
+            .map(|click| &click.camera)
+            .filter(|camera| cameras.contains(camera))
+            .collect();
+        by.len() > 1 || by.iter().any(|camera| self.landmarks_seen_by(camera) >= ENOUGH_FOR_POSE)
+    }
+
+    fn landmarks_seen_by(&self, camera: &CameraName) -> usize {
+        let in_picture = |landmark: &SurveyedLandmark| {
+            landmark.clicks.iter().any(|click| click.camera == *camera)
         };
-        let tells = |landmark: &SurveyedLandmark| {
-            let by: Vec<&CameraName> = landmark
-                .clicks
-                .iter()
-                .map(|click| &click.camera)
-                .filter(|camera| cameras.contains(camera))
-                .collect();
-            by.len() > 1 || by.iter().any(|camera| seen(camera) >= ENOUGH_FOR_POSE)
-        };
-        self.placed_landmarks().filter(|(landmark, _)| tells(landmark)).count()
+        self.placed_landmarks().filter(|(landmark, _)| in_picture(landmark)).count()
     }
 
     /// Landmarks with a place, and not only a direction.

@@ -2,6 +2,7 @@
 //! place.
 
 use crossfix_geometry::{Pose, turn_between, turn_vector};
+use crossfix_message::CameraName;
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
 use super::model::{CameraLabels, CameraUnknowns};
@@ -188,21 +189,13 @@ impl KnownPlaces {
 /// # Errors
 /// Why the landmarks do not tell it.
 fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Result<Option<Pose>, String> {
-    let landmark = |landmark: &SurveyedLandmark| {
-        let click = landmark.clicks.iter().find(|click| click.camera == camera.name)?;
-        Some(Landmark {
-            name: landmark.name.clone(),
-            pixel: click.pixel,
-            click_sd_px: click.sd_px,
-            at: landmark.at,
-        })
-    };
+    let landmarks = survey.landmarks.iter();
     let mut picture = LandmarkPicture {
         camera: camera.name.clone(),
         intrinsics: camera.intrinsics,
         freedom: camera.freedom,
         place: survey.place(&camera.name).cloned(),
-        landmarks: survey.landmarks.iter().filter_map(landmark).collect(),
+        landmarks: landmarks.filter_map(|known| in_picture(known, &camera.name)).collect(),
         sky_turn: Matrix3::zeros(),
     };
     let mut result = match calibrate_landmarks(&picture) {
@@ -220,6 +213,17 @@ fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Result<Option<Pos
         ));
     }
     Ok(Some(*result.camera.pose()))
+}
+
+/// A landmark in the picture of a camera.
+fn in_picture(landmark: &SurveyedLandmark, camera: &CameraName) -> Option<Landmark> {
+    let click = landmark.clicks.iter().find(|click| click.camera == *camera)?;
+    Some(Landmark {
+        name: landmark.name.clone(),
+        pixel: click.pixel,
+        click_sd_px: click.sd_px,
+        at: landmark.at,
+    })
 }
 
 fn middle(places: impl ExactSizeIterator<Item = Point3<f64>>) -> Point3<f64> {

@@ -185,14 +185,7 @@ impl BegunFlight {
 
     /// Priors and noise of the first round.
     pub(super) fn priors(&self) -> Priors {
-        let prior = |camera: &CameraLabels| CameraPriors {
-            noise: FIRST_NOISE,
-            lens: camera.intrinsics,
-            freedom: camera.freedom,
-            frame_s: frame_time(camera),
-            wander: FIRST_WANDER,
-        };
-        let cameras = self.cameras.iter().map(prior).collect();
+        let cameras = self.cameras.iter().map(first_priors).collect();
         Priors { jerk: self.course.jerk, rate_sd: RATE_SD, cameras }
     }
 
@@ -332,6 +325,16 @@ fn target_of(
     (own, start)
 }
 
+fn first_priors(camera: &CameraLabels) -> CameraPriors {
+    CameraPriors {
+        noise: FIRST_NOISE,
+        lens: camera.intrinsics,
+        freedom: camera.freedom,
+        frame_s: frame_time(camera),
+        wander: FIRST_WANDER,
+    }
+}
+
 /// Whether a start lies near enough to a course.
 fn fits(misfit: f64, state: &CameraUnknowns, course: &Course) -> bool {
     let of_errors = LOG_DEVIATIONS * course.errors.sd_m.hypot(course.errors.drift_sd_m);
@@ -363,7 +366,11 @@ struct BeginWith<'a> {
 
 impl<'a> BeginWith<'a> {
     fn found(cameras: [&'a CameraLabels; 2], sights: [&Sights; 2]) -> Vec<Self> {
-        let of_pair = |pair: CameraPair| Self {
+        pairs::find(sights[0], sights[1]).iter().map(|pair| Self::of_pair(cameras, pair)).collect()
+    }
+
+    fn of_pair(cameras: [&'a CameraLabels; 2], pair: &CameraPair) -> Self {
+        Self {
             cameras,
             poses: [
                 (Rotation3::identity(), Point3::origin(), 0.0),
@@ -371,8 +378,7 @@ impl<'a> BeginWith<'a> {
             ],
             doubt: pair.doubt,
             is_known: false,
-        };
-        pairs::find(sights[0], sights[1]).into_iter().map(of_pair).collect()
+        }
     }
 
     fn known(

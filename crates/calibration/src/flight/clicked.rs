@@ -5,6 +5,7 @@ use nalgebra::{DMatrix, DVector, Dyn, OMatrix, U3, Vector2};
 
 use super::model::POSE_AND_CLOCK;
 use super::noise::Tails;
+use super::normal::Derivative;
 use super::rows::{ResidualRow, Sink, UNSEEN};
 use super::state::{Flight, FlightState};
 use crate::landmarks::seen::{self, ClickResidual, POSE};
@@ -79,19 +80,7 @@ impl FlightState {
         noise += &by_place * by_place.transpose();
         let whitening = noise.cholesky()?.l().try_inverse()?;
         residual = &whitening * residual;
-        let row = |row: usize| -> ResidualRow {
-            let mut terms = Vec::new();
-            // The whitening matrix is lower triangular: each row only depends on its own click and
-            // those before.
-            for (k, (index, _, seen)) in clicks[..=row / 2].iter().enumerate() {
-                let by = whitening.view((row, 2 * k), (1, 2)) * &seen.by;
-                let unknown =
-                    |own: usize| if own < POSE { own } else { own - POSE + POSE_AND_CLOCK };
-                let own = by.iter().enumerate();
-                terms.extend(own.map(|(own, value)| (starts[*index] + unknown(own), *value)));
-            }
-            (terms, residual[row])
-        };
+        let row = |row: usize| (derivatives(clicks, &whitening, row, &starts), residual[row]);
         Some((0..rows).map(row).collect())
     }
 
@@ -112,6 +101,25 @@ impl FlightState {
         });
         misfits.collect()
     }
+}
+
+/// Derivatives of a row of the whitened clicks.
+fn derivatives(
+    clicks: &[(usize, &Click, ClickResidual)],
+    whitening: &DMatrix<f64>,
+    row: usize,
+    starts: &[usize],
+) -> Vec<Derivative> {
+    let mut terms = Vec::new();
+    // The whitening matrix is lower triangular: each row only depends on its own click and those
+    // before.
+    for (k, (index, _, seen)) in clicks[..=row / 2].iter().enumerate() {
+        let by = whitening.view((row, 2 * k), (1, 2)) * &seen.by;
+        let unknown = |own: usize| if own < POSE { own } else { own - POSE + POSE_AND_CLOCK };
+        let own = by.iter().enumerate();
+        terms.extend(own.map(|(own, value)| (starts[*index] + unknown(own), *value)));
+    }
+    terms
 }
 
 fn deviations(seen: &ClickResidual, click: &Click) -> Option<f64> {

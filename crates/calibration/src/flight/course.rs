@@ -1,6 +1,6 @@
 //! The target's trajectory before all cameras are known: by a log, or by two cameras.
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 
 use super::adjustment::{self, NEARLY_SETTLED};
 use super::model::{FlightLog, LogErrors};
@@ -77,26 +77,28 @@ impl Course {
         Self::along(TrajectorySpline::over(0.0, 1.0), 1.0, errors, Vec::new())
     }
 
-    /// Makes a spline follow the course: as it is where it is known, straight from one known place
-    /// to the next, and constant before its begin and after its end. A smooth trajectory through an
-    /// unknown stretch swings far out, and labels there would be left beside it.
+    /// Makes a spline follow the course. A smooth trajectory through an unknown stretch swings far
+    /// out, and labels there would be left beside it.
     pub(super) fn lead(&self, way: &mut TrajectorySpline) {
+        way.lead(|time_s| self.place_throughout(time_s));
+    }
+
+    /// The place at any time: as it is where it is known, straight from one known place to the
+    /// next, and constant before the begin and after the end.
+    fn place_throughout(&self, time_s: f64) -> Option<Vector3<f64>> {
         let known = |time_s: f64| Some(self.way.place(&self.way.weights(time_s)?).coords);
-        let at = |time_s: f64| {
-            if self.weights(time_s).is_some() {
-                return known(time_s);
+        if self.weights(time_s).is_some() {
+            return known(time_s);
+        }
+        let next = self.times_s.partition_point(|known| *known < time_s);
+        let before = next.checked_sub(1).map(|before| self.times_s[before]);
+        match (before, self.times_s.get(next).copied()) {
+            (Some(before), Some(after)) => {
+                let share = (time_s - before) / (after - before);
+                Some(known(before)?.lerp(&known(after)?, share))
             }
-            let next = self.times_s.partition_point(|known| *known < time_s);
-            let before = next.checked_sub(1).map(|before| self.times_s[before]);
-            match (before, self.times_s.get(next).copied()) {
-                (Some(before), Some(after)) => {
-                    let share = (time_s - before) / (after - before);
-                    Some(known(before)?.lerp(&known(after)?, share))
-                }
-                (end, None) | (None, end) => known(end?),
-            }
-        };
-        way.lead(at);
+            (end, None) | (None, end) => known(end?),
+        }
     }
 
     /// Range of its times, s.

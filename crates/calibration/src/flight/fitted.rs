@@ -3,7 +3,7 @@
 use crossfix_geometry::Pixel;
 use nalgebra::{Point3, Vector2, Vector3};
 
-use super::model::FlightLog;
+use super::model::{FlightLog, Label, LogSample};
 use super::state::{Flight, FlightState};
 
 /// A label, compared with where its target should have been seen.
@@ -63,35 +63,37 @@ impl FittedSample {
 
 /// A camera's labels where the trajectory reaches them, in the order of its own time.
 pub(super) fn labels(flight: &Flight<'_>, state: &FlightState, index: usize) -> Vec<FittedLabel> {
-    let camera = &state.cameras[index];
-    let fitted = |label: &super::Label| {
-        let time_s = camera.time_s(label);
-        let weights = state.way.weights(time_s)?;
-        let (_, _, seen) = state.see(index, label)?;
-        Some(FittedLabel {
-            own_time_s: label.time_s,
-            time_s,
-            pixel: label.pixel,
-            beside_px: -seen.residual,
-            motion_px_per_s: seen.by_time,
-            place: state.way.place(&weights),
-        })
-    };
-    flight.cameras[index].labels.iter().filter_map(fitted).collect()
+    let labels = flight.cameras[index].labels.iter();
+    labels.filter_map(|label| fitted_label(state, index, label)).collect()
+}
+
+fn fitted_label(state: &FlightState, index: usize, label: &Label) -> Option<FittedLabel> {
+    let time_s = state.cameras[index].time_s(label);
+    let weights = state.way.weights(time_s)?;
+    let (_, _, seen) = state.see(index, label)?;
+    Some(FittedLabel {
+        own_time_s: label.time_s,
+        time_s,
+        pixel: label.pixel,
+        beside_px: -seen.residual,
+        motion_px_per_s: seen.by_time,
+        place: state.way.place(&weights),
+    })
 }
 
 /// A log's samples at times of the trajectory.
 pub(super) fn samples(log: &FlightLog, state: &FlightState) -> Vec<FittedSample> {
-    let fitted = |sample: &super::LogSample| {
-        let weights = state.way.weights(sample.time_s)?;
-        Some(FittedSample {
-            time_s: sample.time_s,
-            logged: sample.position,
-            place: state.way.place(&weights),
-            bias: Vector3::from_fn(|axis, _| state.bias[axis].at(sample.time_s)),
-        })
-    };
-    log.samples.iter().filter_map(fitted).collect()
+    log.samples.iter().filter_map(|sample| fitted_sample(state, sample)).collect()
+}
+
+fn fitted_sample(state: &FlightState, sample: &LogSample) -> Option<FittedSample> {
+    let weights = state.way.weights(sample.time_s)?;
+    Some(FittedSample {
+        time_s: sample.time_s,
+        logged: sample.position,
+        place: state.way.place(&weights),
+        bias: Vector3::from_fn(|axis, _| state.bias[axis].at(sample.time_s)),
+    })
 }
 
 #[cfg(test)]

@@ -33,15 +33,7 @@ pub(super) fn ratios(
 
 fn compared(flight: &Flight<'_>, priors: &Priors, state: &FlightState) -> Option<Vec<Option<f64>>> {
     let middle_s = middle(flight, state)?;
-    let half = |is_late: bool| -> Vec<CameraLabels> {
-        let of_camera = |(camera, state): (&CameraLabels, &CameraUnknowns)| {
-            let is_in = |label: &&Label| (state.time_s(label) >= middle_s) == is_late;
-            let labels = camera.labels.iter().filter(is_in).copied().collect();
-            CameraLabels { labels, ..camera.clone() }
-        };
-        flight.cameras.iter().zip(&state.cameras).map(of_camera).collect()
-    };
-    let halves = [half(false), half(true)];
+    let halves = [false, true].map(|is_late| half(flight, state, middle_s, is_late));
     let [first, second] = [0, 1].map(|k| {
         let flight = Flight { cameras: &halves[k], ..*flight };
         adjustment::adjust(&flight, priors, state.clone(), NEARLY_SETTLED)
@@ -68,6 +60,20 @@ fn middle(flight: &Flight<'_>, state: &FlightState) -> Option<f64> {
         flight.cameras.iter().zip(&state.cameras).flat_map(of_camera).collect();
     times.sort_unstable_by(f64::total_cmp);
     times.get(times.len() / 2).copied()
+}
+
+fn half(
+    flight: &Flight<'_>,
+    state: &FlightState,
+    middle_s: f64,
+    is_late: bool,
+) -> Vec<CameraLabels> {
+    let of_camera = |(camera, state): (&CameraLabels, &CameraUnknowns)| {
+        let is_in = |label: &&Label| (state.time_s(label) >= middle_s) == is_late;
+        let labels = camera.labels.iter().filter(is_in).copied().collect();
+        CameraLabels { labels, ..camera.clone() }
+    };
+    flight.cameras.iter().zip(&state.cameras).map(of_camera).collect()
 }
 
 /// Difference between the halves of the cameras' own unknowns, without the datum, and the

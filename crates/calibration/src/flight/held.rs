@@ -30,14 +30,8 @@ pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey) {
 /// deviation of that, s: the median of what the cameras state, as one clock may have been set
 /// again. Clocks that no flight has calibrated are not counted.
 fn later(result: &FlightResult, survey: &Survey) -> Option<(f64, f64)> {
-    let says = |found: &CameraResult| {
-        let known = survey.known(&found.name)?;
-        known.clock.knots_s.first()?;
-        let middle = found.clock.knots.get(found.clock.knots.len() / 2)?;
-        let (ahead_s, sd_s) = known.clock.at(middle.time_s);
-        Some((ahead_s - middle.ahead_s, sd_s.max(LEAST_CLOCK_SD_S)))
-    };
-    let mut said: Vec<(f64, f64)> = result.cameras.iter().filter_map(says).collect();
+    let mut said: Vec<(f64, f64)> =
+        result.cameras.iter().filter_map(|camera| later_by_clock(camera, survey)).collect();
     said.sort_by(|a, b| a.0.total_cmp(&b.0));
     // Weighted median: the value at which the summed weights 1 / sd^2 reach half of their total.
     let half: f64 = said.iter().map(|(_, sd_s)| sd_s.powi(-2)).sum::<f64>() / 2.0;
@@ -52,4 +46,13 @@ fn later(result: &FlightResult, survey: &Survey) -> Option<(f64, f64)> {
         said.iter().map(|(later_s, sd_s)| ((later_s - middle) / sd_s).abs().min(3.0).powi(2)).sum();
     let spread = (beside / said.len() as f64).max(1.0);
     Some((middle, (std::f64::consts::FRAC_PI_2 * spread / (2.0 * half)).sqrt()))
+}
+
+/// The same by the clock of one camera.
+fn later_by_clock(found: &CameraResult, survey: &Survey) -> Option<(f64, f64)> {
+    let known = survey.known(&found.name)?;
+    known.clock.knots_s.first()?;
+    let middle = found.clock.knots.get(found.clock.knots.len() / 2)?;
+    let (ahead_s, sd_s) = known.clock.at(middle.time_s);
+    Some((ahead_s - middle.ahead_s, sd_s.max(LEAST_CLOCK_SD_S)))
 }

@@ -192,28 +192,27 @@ fn offset(
     };
     let (least, most) = (from - other_to, to - other_from);
     let steps = ((most - least) / STEP_S) as usize;
-    let mut best = (f64::INFINITY, 0.0);
-    let mut attempt = |ahead_s: f64| {
-        let misfit = misfit(ahead_s);
-        if misfit < best.0 {
-            best = (misfit, ahead_s);
-        }
-        best.1
-    };
-    (0..=steps).for_each(|k| {
-        attempt(least + k as f64 * STEP_S);
-    });
+    let offsets_s = (0..=steps).map(|k| least + k as f64 * STEP_S);
+    let mut best = best_offset((0.0, f64::INFINITY), offsets_s, misfit);
     let mut coarser = STEP_S;
     for step in FINER {
-        let about = attempt(f64::NAN);
+        let about = best.0;
         let reach = (coarser / step) as i32;
-        (-reach..=reach).for_each(|k| {
-            attempt(about + f64::from(k) * step);
-        });
+        let offsets_s = (-reach..=reach).map(|k| about + f64::from(k) * step);
+        best = best_offset(best, offsets_s, misfit);
         coarser = step;
     }
-    let (misfit_rad, ahead_s) = best;
-    misfit_rad.is_finite().then_some((ahead_s, misfit_rad))
+    best.1.is_finite().then_some(best)
+}
+
+/// The best of these offsets and one that is known, each with its misfit.
+fn best_offset(
+    known: (f64, f64),
+    offsets_s: impl Iterator<Item = f64>,
+    misfit: impl Fn(f64) -> f64,
+) -> (f64, f64) {
+    let tried = offsets_s.map(|ahead_s| (ahead_s, misfit(ahead_s)));
+    tried.fold(known, |best, other| if other.1 < best.1 { other } else { best })
 }
 
 /// Of the four poses that an essential matrix allows, the one with most of the target ahead of both

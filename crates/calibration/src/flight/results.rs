@@ -267,22 +267,13 @@ fn clock_result(
     wander: f64,
 ) -> ClockResult {
     let state = &adjusted.state;
-    let (order, start) = (state.order(), state.starts()[index]);
+    let start = state.starts()[index];
     let clock = &state.cameras[index].clock;
     let labels = &flight.cameras[index].labels;
     let times = labels.first().zip(labels.last());
     let (from, to) = times.map_or((0.0, 0.0), |(first, last)| (first.time_s, last.time_s));
     let steps = ((to - from) / CLOCK_STEP_S).ceil().max(1.0);
-    let knot = |k: usize| {
-        let time_s = from + (to - from) * k as f64 / steps;
-        // The common time depends on two knots of the wander, on the offset, and on the rate.
-        let of_wander = clock.wander.weights(clock.straight_s(time_s));
-        let [first, second] = of_wander.map(|(k, weight)| (order.wander(k, index), weight));
-        let rate = (start + CLOCK + 1, time_s - clock.reference_s);
-        let terms = [first, second, (start + CLOCK, 1.0), rate];
-        let sd_s = adjusted.covariance.variance(&terms).max(0.0).sqrt();
-        ClockKnot { time_s, ahead_s: clock.common_s(time_s) - time_s, sd_s }
-    };
+    let knot = |k: usize| clock_knot(adjusted, index, from + (to - from) * k as f64 / steps);
     let variance = |unknown: usize| adjusted.covariance.variance(&[(start + unknown, 1.0)]);
     let sd = |unknown: usize| variance(unknown).max(0.0).sqrt();
     ClockResult {
@@ -293,6 +284,19 @@ fn clock_result(
         readout_s: clock.readout_s,
         readout_sd_s: sd(CLOCK + 2),
     }
+}
+
+fn clock_knot(adjusted: &AdjustedFlight, index: usize, time_s: f64) -> ClockKnot {
+    let state = &adjusted.state;
+    let (order, start) = (state.order(), state.starts()[index]);
+    let clock = &state.cameras[index].clock;
+    // The common time depends on two knots of the wander, on the offset, and on the rate.
+    let of_wander = clock.wander.weights(clock.straight_s(time_s));
+    let [first, second] = of_wander.map(|(k, weight)| (order.wander(k, index), weight));
+    let rate = (start + CLOCK + 1, time_s - clock.reference_s);
+    let terms = [first, second, (start + CLOCK, 1.0), rate];
+    let sd_s = adjusted.covariance.variance(&terms).max(0.0).sqrt();
+    ClockKnot { time_s, ahead_s: clock.common_s(time_s) - time_s, sd_s }
 }
 
 impl CameraResult {

@@ -80,6 +80,14 @@ impl<'a> Things<'a> {
         start::of_labels(self.camera, labels.collect())
     }
 
+    /// The labels that fit a course; all where too few do.
+    fn along(&self, course: Option<&Course>) -> CameraLabels {
+        let by_course = course
+            .and_then(|course| start::among_others(self.camera, course, self.frame_s))
+            .filter(|own| own.labels.len() >= LEAST_LABELS);
+        by_course.unwrap_or_else(|| self.camera.clone())
+    }
+
     /// Whether a piece was followed at other times than these labels.
     fn is_beside(&self, piece: usize, own: &CameraLabels) -> bool {
         let is_at_once =
@@ -243,14 +251,8 @@ impl Joined {
         let placed = [0, 1].map(|side| (&sights[side], &states[side]));
         let course = Course::of(&triangulation::log(&placed));
         let of_camera = |(index, things): (usize, &Things<'_>)| {
-            if let Some(side) = self.cameras.iter().position(|camera| *camera == index) {
-                return own[side].clone();
-            }
-            let by_course = course
-                .as_ref()
-                .and_then(|course| start::among_others(things.camera, course, things.frame_s))
-                .filter(|own| own.labels.len() >= LEAST_LABELS);
-            by_course.unwrap_or_else(|| things.camera.clone())
+            let side = self.cameras.iter().position(|camera| *camera == index);
+            side.map_or_else(|| things.along(course.as_ref()), |side| own[side].clone())
         };
         things.iter().enumerate().map(of_camera).collect()
     }

@@ -99,8 +99,9 @@ pub(super) fn find(
     misfit: f64,
 ) -> Option<WouldFit> {
     let better = |found: f64| found * CLEARLY_BETTER < misfit && found < FITS_RAD;
-    let frame_s = frame_time(camera);
-    if start::find(camera, &course.mirrored(), frame_s).is_some_and(|(_, found)| better(found)) {
+    if start::find(camera, &course.mirrored(), frame_time(camera))
+        .is_some_and(|(_, found)| better(found))
+    {
         return Some(WouldFit::MirrorImage);
     }
     // Where any linear map fits, the labels are of the right target.
@@ -109,15 +110,8 @@ pub(super) fn find(
     if stretched.is_some() {
         return stretched;
     }
-    let with_lens = |other: &CameraLabels| {
-        let is_seen = camera.labels.iter().all(|label| {
-            let size = other.intrinsics.size;
-            label.pixel.x() <= f64::from(size.width) && label.pixel.y() <= f64::from(size.height)
-        });
-        let lent = CameraLabels { intrinsics: other.intrinsics, ..camera.clone() };
-        let found = is_seen.then(|| start::find(&lent, course, frame_s)).flatten()?;
-        Some((found.1, other.name.clone()))
-    };
+    let with_lens =
+        |other: &CameraLabels| Some((with_lens_of(camera, course, other)?, other.name.clone()));
     let lent = others.iter().filter(|other| is_another(other, camera)).filter_map(with_lens);
     let lent = lent.min_by(|a, b| a.0.total_cmp(&b.0));
     // Another camera's lens may be close to the zoomed focal length.
@@ -135,6 +129,18 @@ pub(super) fn find(
 /// Whether another camera has a different lens.
 fn is_another(other: &CameraLabels, camera: &CameraLabels) -> bool {
     other.name != camera.name && other.intrinsics != camera.intrinsics
+}
+
+/// A camera's misfit to the course with another camera's lens, rad; `None` where its labels lie
+/// outside that camera's image.
+fn with_lens_of(camera: &CameraLabels, course: &Course, other: &CameraLabels) -> Option<f64> {
+    let is_seen = camera.labels.iter().all(|label| {
+        let size = other.intrinsics.size;
+        label.pixel.x() <= f64::from(size.width) && label.pixel.y() <= f64::from(size.height)
+    });
+    let lent = CameraLabels { intrinsics: other.intrinsics, ..camera.clone() };
+    let found = is_seen.then(|| start::find(&lent, course, frame_time(camera))).flatten();
+    found.map(|(_, misfit)| misfit)
 }
 
 /// A camera's misfit to the course with another focal length, rad.

@@ -227,17 +227,6 @@ fn suspects(
     (adjusted, result): (&AdjustedCamera, &LandmarkResult),
     needed: usize,
 ) -> Vec<String> {
-    let without = |index: usize| {
-        let mut rest = picture.clone();
-        rest.landmarks.remove(index);
-        // Not only the state that the wrong landmark has bent is a start.
-        let mut starts = start::starts(&rest).unwrap_or_default();
-        starts.push(adjusted.state.clone());
-        let adjusted = starts.into_iter().filter_map(|start| adjustment::adjust(&rest, start));
-        let best = adjusted.min_by(|a, b| a.cost.total_cmp(&b.cost))?;
-        let result = self::result(&rest, &best)?;
-        (!result.is_wrong()).then(|| picture.landmarks[index].name.clone())
-    };
     if picture.landmarks.len() <= needed {
         return Vec::new();
     }
@@ -246,7 +235,21 @@ fn suspects(
     likely.sort_by(|a, b| deviations(b).total_cmp(&deviations(a)));
     likely.truncate(MOST_SUSPECTS);
     likely.sort_unstable();
-    likely.into_iter().filter_map(without).collect()
+    let is_suspect = |index: &usize| fits_without(picture, adjusted, *index);
+    let suspects = likely.into_iter().filter(is_suspect);
+    suspects.map(|index| picture.landmarks[index].name.clone()).collect()
+}
+
+/// Whether a picture fits once a landmark is left out.
+fn fits_without(picture: &LandmarkPicture, adjusted: &AdjustedCamera, index: usize) -> bool {
+    let mut rest = picture.clone();
+    rest.landmarks.remove(index);
+    // Not only the state that the wrong landmark has bent is a start.
+    let mut starts = start::starts(&rest).unwrap_or_default();
+    starts.push(adjusted.state.clone());
+    let adjusted = starts.into_iter().filter_map(|start| adjustment::adjust(&rest, start));
+    let best = adjusted.min_by(|a, b| a.cost.total_cmp(&b.cost));
+    best.and_then(|best| result(&rest, &best)).is_some_and(|result| !result.is_wrong())
 }
 
 /// Number of landmarks that are left out in turn, those with the largest deviations: each takes a
