@@ -93,14 +93,20 @@ fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) 
         .map(|(index, camera)| PlannedObserver::new(camera, phase(index), assumptions))
         .collect();
     let stride = volume.centres().count().div_ceil(SAMPLE).max(1);
-    let known = |(_, point): (usize, Point3<f64>)| {
-        let theirs: Vec<FisherInformation> =
-            observers.iter().filter_map(|o| o.information(point)).collect();
-        let mut information = prior(assumptions);
-        theirs.iter().for_each(|one| information += one);
-        KnownCube { point, cameras: theirs.len(), information }
-    };
-    volume.centres().step_by(stride).map(known).collect()
+    let sample = volume.centres().step_by(stride);
+    sample.map(|(_, point)| known_cube(point, &observers, assumptions)).collect()
+}
+
+fn known_cube(
+    point: Point3<f64>,
+    observers: &[PlannedObserver<'_>],
+    assumptions: &Assumptions,
+) -> KnownCube {
+    let theirs: Vec<FisherInformation> =
+        observers.iter().filter_map(|o| o.information(point)).collect();
+    let mut information = prior(assumptions);
+    theirs.iter().for_each(|one| information += one);
+    KnownCube { point, cameras: theirs.len(), information }
 }
 
 fn score_with(known: &[KnownCube], extra: Option<&PlannedObserver>, worst_m: f64) -> Score {
@@ -145,16 +151,10 @@ pub fn advise(
 
     let known = known(cameras, volume, assumptions);
     let worst_m = volume.diagonal_m();
+    let phase = cameras.len() as f64 / (cameras.len() + 1) as f64;
     let candidate = |ring: f64, direction: u32| {
-        let (sin, cos) =
-            (f64::from(direction) / f64::from(DIRECTIONS) * std::f64::consts::TAU).sin_cos();
-        let offset = Vector3::new(cos, sin, 0.0) * (ring * distance);
-        let place = Point3::new(middle.x + offset.x, middle.y + offset.y, height);
-        let pose = Pose::looking_at(place, middle).ok()?;
-        let camera = Camera::new(*like.camera.model().intrinsics(), pose).ok()?;
-        let pose_covariance = carried(like, &camera);
-        let more = PlannedCamera { camera, pose_covariance, ..like.clone() };
-        let phase = cameras.len() as f64 / (cameras.len() + 1) as f64;
+        let place = on_ring(middle, ring * distance, height, direction);
+        let more = moved(like, place, middle)?;
         let observer = PlannedObserver::new(&more, phase, assumptions);
         let score = score_with(&known, Some(&observer), worst_m);
         Some(CandidatePlace { position_m: place.into(), score })
@@ -170,6 +170,21 @@ pub fn advise(
     });
     let now = score_with(&known, None, worst_m);
     Some(Advice { like: like.name.clone(), look_at_m: middle.into(), now, candidates })
+}
+
+fn on_ring(middle: Point3<f64>, radius_m: f64, height: f64, direction: u32) -> Point3<f64> {
+    let (sin, cos) =
+        (f64::from(direction) / f64::from(DIRECTIONS) * std::f64::consts::TAU).sin_cos();
+    let offset = Vector3::new(cos, sin, 0.0) * radius_m;
+    Point3::new(middle.x + offset.x, middle.y + offset.y, height)
+}
+
+/// A camera like another, at a place and aimed at a point.
+fn moved(like: &PlannedCamera, place: Point3<f64>, point: Point3<f64>) -> Option<PlannedCamera> {
+    let pose = Pose::looking_at(place, point).ok()?;
+    let camera = Camera::new(*like.camera.model().intrinsics(), pose).ok()?;
+    let pose_covariance = carried(like, &camera);
+    Some(PlannedCamera { camera, pose_covariance, ..like.clone() })
 }
 
 /// A camera's pose covariance, transferred to another pose: the position's errors turn with the

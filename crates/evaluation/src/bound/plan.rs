@@ -206,19 +206,26 @@ pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumpt
         .enumerate()
         .map(|(index, camera)| PlannedObserver::new(camera, phase(index), assumptions))
         .collect();
-    let cell = |(layer, centre): (usize, Point3<f64>)| {
-        let mut information = prior(assumptions);
-        let mut seen = Vec::new();
-        for (index, observer) in observers.iter().enumerate() {
-            if let Some(theirs) = observer.information(centre) {
-                information += &theirs;
-                seen.push(index);
-            }
+    let centres = volume.centres();
+    centres.map(|(layer, centre)| cell(layer, centre, &observers, assumptions)).collect()
+}
+
+fn cell(
+    layer: usize,
+    centre: Point3<f64>,
+    observers: &[PlannedObserver<'_>],
+    assumptions: &Assumptions,
+) -> Cell {
+    let mut information = prior(assumptions);
+    let mut seen = Vec::new();
+    for (index, observer) in observers.iter().enumerate() {
+        if let Some(theirs) = observer.information(centre) {
+            information += &theirs;
+            seen.push(index);
         }
-        let accuracy = accuracy(seen.len(), &information);
-        Cell { layer, centre_m: centre.into(), cameras: seen, accuracy }
-    };
-    volume.centres().map(cell).collect()
+    }
+    let accuracy = accuracy(seen.len(), &information);
+    Cell { layer, centre_m: centre.into(), cameras: seen, accuracy }
 }
 
 /// The smallest target, m, that two cameras see at a point when it must span `least_px` pixels;

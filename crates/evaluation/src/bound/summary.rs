@@ -99,18 +99,32 @@ pub fn contributions(
     cells: &[Cell],
 ) -> Vec<Contribution> {
     let of = |(index, camera): (usize, &PlannedCamera)| {
-        let others: Vec<PlannedCamera> = cameras
-            .iter()
-            .enumerate()
-            .filter(|(other, _)| *other != index)
-            .map(|(_, c)| c.clone())
-            .collect();
-        let lens = camera.camera.model().intrinsics();
+        let without = without(index, cameras, volume, assumptions);
         let seen = cells.iter().filter(|cell| cell.cameras.contains(&index)).count();
+        let sees = seen as f64 / cells.len().max(1) as f64;
+        Contribution::of(camera, assumptions, sees, without)
+    };
+    cameras.iter().enumerate().map(of).collect()
+}
+
+fn without(
+    index: usize,
+    cameras: &[PlannedCamera],
+    volume: &Volume,
+    assumptions: &Assumptions,
+) -> Summary {
+    let mut others = cameras.to_vec();
+    others.remove(index);
+    Summary::of(&predict(&others, volume, assumptions))
+}
+
+impl Contribution {
+    fn of(camera: &PlannedCamera, assumptions: &Assumptions, sees: f64, without: Summary) -> Self {
+        let lens = camera.camera.model().intrinsics();
         let per_axis = |first: usize| {
             (camera.pose_covariance.fixed_view::<3, 3>(first, first).trace() / 3.0).sqrt()
         };
-        Contribution {
+        Self {
             name: camera.name.clone(),
             rate_hz: camera.rate_hz,
             clock_sd_s: camera.clock_sd_s,
@@ -118,11 +132,10 @@ pub fn contributions(
             bearing_sd_rad: camera.pixel_sd_px / (lens.fx * lens.fy).sqrt(),
             rotation_sd_rad: per_axis(0),
             position_sd_m: per_axis(3),
-            sees: seen as f64 / cells.len().max(1) as f64,
-            without: Summary::of(&predict(&others, volume, assumptions)),
+            sees,
+            without,
         }
-    };
-    cameras.iter().enumerate().map(of).collect()
+    }
 }
 
 #[cfg(test)]

@@ -79,13 +79,6 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             ratios.push(TableRow { paper, limit, ..row });
         }
     }
-    let table = |name, title: &str, y, rows| Table {
-        name,
-        title: title.to_owned(),
-        x: "lambda, 1/s",
-        y,
-        rows,
-    };
     vec![
         table(
             "brightness",
@@ -95,4 +88,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         ),
         table("brightness-ratio", "Smoothing's error over the IMM's", "ratio", ratios),
     ]
+}
+
+fn table(name: &'static str, title: &str, y: &'static str, rows: Vec<TableRow>) -> Table {
+    Table { name, title: title.to_owned(), x: "lambda, 1/s", y, rows }
 }

@@ -18,23 +18,18 @@ fn filter_nees(options: ValidationOptions, sigma_a: f64) -> (f64, f64) {
     let samples = runs::all(CHEAP * options.runs, |run| {
         let mut noise = Noise::new(options.seed, run);
         let (mut position, mut velocity) = (0.0, 10.0);
-        let mut next = |noise: &mut Noise| {
+        let measured: [AxisMeasurement; FRAMES] = std::array::from_fn(|_| {
             let acceleration = sigma_a * noise.normal();
             position += velocity + acceleration / 2.0;
             velocity += acceleration;
-            let measured = AxisMeasurement { position: position + noise.normal(), variance: 1.0 };
-            (position, velocity, measured)
-        };
-        let (first, second) = (next(&mut noise).2, next(&mut noise).2);
-        let mut filter = AxisFilter::start(first, second, 1.0, sigma_a);
-        let mut truth = (0.0, 0.0);
-        for _ in 2..FRAMES {
-            let (position, velocity, measured) = next(&mut noise);
+            AxisMeasurement { position: position + noise.normal(), variance: 1.0 }
+        });
+        let mut filter = AxisFilter::start(measured[0], measured[1], 1.0, sigma_a);
+        for measured in &measured[2..] {
             filter.time_update(1.0);
-            filter.measurement_update(measured);
-            truth = (position, velocity);
+            filter.measurement_update(*measured);
         }
-        let error = Vector2::new(truth.0 - filter.position(), truth.1 - filter.velocity());
+        let error = Vector2::new(position - filter.position(), velocity - filter.velocity());
         let inverse = filter.covariance().try_inverse();
         inverse.map_or(f64::NAN, |inverse| (error.transpose() * inverse * error).x)
     });

@@ -40,16 +40,7 @@ pub(crate) fn all<T: Send>(count: usize, run: impl Fn(usize) -> T + Sync) -> Vec
     let workers = std::thread::available_parallelism().map_or(1, usize::from).min(count.max(1));
     let next = AtomicUsize::new(0);
     let mut results: Vec<(usize, T)> = std::thread::scope(|scope| {
-        let work = || {
-            let mut done = Vec::new();
-            loop {
-                let index = next.fetch_add(1, Ordering::Relaxed);
-                if index >= count {
-                    return done;
-                }
-                done.push((index, run(index)));
-            }
-        };
+        let work = || work(&next, count, &run);
         let threads: Vec<_> = (0..workers).map(|_| scope.spawn(work)).collect();
         // If a run panics, the whole experiment does.
         threads
@@ -61,4 +52,16 @@ pub(crate) fn all<T: Send>(count: usize, run: impl Fn(usize) -> T + Sync) -> Vec
     });
     results.sort_by_key(|(index, _)| *index);
     results.into_iter().map(|(_, result)| result).collect()
+}
+
+/// The results of those runs that one worker comes to, with their numbers.
+fn work<T>(next: &AtomicUsize, count: usize, run: impl Fn(usize) -> T) -> Vec<(usize, T)> {
+    let mut done = Vec::new();
+    loop {
+        let index = next.fetch_add(1, Ordering::Relaxed);
+        if index >= count {
+            return done;
+        }
+        done.push((index, run(index)));
+    }
 }

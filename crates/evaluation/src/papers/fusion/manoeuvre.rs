@@ -102,55 +102,22 @@ struct FilterErrors {
 
 impl FilterChoice {
     fn follow(&self, flight: &TurningFlight, deviation: f64) -> FilterErrors {
-        let start = KinematicState {
-            mean: Vector6::zeros(),
-            covariance: Matrix6::identity() * IGNORANCE.powi(2),
-        };
-        let spread = Matrix3::identity() * deviation.powi(2);
-        let mut alarms = Vec::new();
-        let places: Vec<Point3<f64>> = match self {
-            Self::Measurement => flight.measured.clone(),
+        let (places, alarms) = match self {
+            Self::Measurement => (flight.measured.clone(), Vec::new()),
             Self::Imm(models) => {
-                let mut imm = Imm::new(start, models);
+                let (mut imm, spread) = (Imm::new(start(), models), spread(deviation));
                 let step = |z: &Point3<f64>| {
                     imm.update(STEP, models, |state| state.position_updated(*z, &spread));
                     imm.combined().position()
                 };
-                flight.measured.iter().map(step).collect()
+                (flight.measured.iter().map(step).collect(), Vec::new())
             }
-            Self::Kalman(density) | Self::Nis(density) => {
-                let mut state = start;
-                let mut detector = NormalisedInnovation::new(2, 1e-4);
-                let watches = matches!(self, Self::Nis(_));
-                let step = |(frame, z): (usize, &Point3<f64>)| {
-                    state.time_update(STEP, *density);
-                    let nis = nis(&state, *z, &spread);
-                    if watches && nis.is_some_and(|nis| detector.see(nis, 3)) {
-                        alarms.push(frame);
-                        // Before the update, so that the filter relies on this measurement.
-                        state.reinitialise(IGNORANCE, IGNORANCE);
-                    }
-                    update(&mut state, *z, &spread);
-                    state.position()
-                };
-                flight.measured.iter().enumerate().map(step).collect()
+            Self::Kalman(density) => by_kalman(flight, deviation, *density, None),
+            Self::Nis(density) => {
+                let detector = NormalisedInnovation::new(2, 1e-4);
+                by_kalman(flight, deviation, *density, Some(detector))
             }
-            Self::Smoothed(window) => {
-                let mut state = start;
-                let mut detector = SmoothedResidual::new(*window, SCALE);
-                let step = |(frame, z): (usize, &Point3<f64>)| {
-                    state.time_update(STEP, LOW_DENSITY);
-                    let alarm = detector.see((z - state.position()) / deviation);
-                    update(&mut state, *z, &spread);
-                    if alarm {
-                        alarms.push(frame);
-                        // In place of the updated covariance (Kalinov 2019, eqs. 8 and 9).
-                        state.reinitialise(IGNORANCE, IGNORANCE);
-                    }
-                    state.position()
-                };
-                flight.measured.iter().enumerate().map(step).collect()
-            }
+            Self::Smoothed(window) => by_smoothed_residual(flight, deviation, *window),
         };
         let mut squares = [0.0; 3];
         let judged = places.iter().zip(&flight.places).skip(SETTLING);
@@ -173,6 +140,60 @@ impl FilterChoice {
             Self::Imm(_) => "interacting models".to_owned(),
         }
     }
+}
+
+fn start() -> KinematicState {
+    KinematicState { mean: Vector6::zeros(), covariance: Matrix6::identity() * IGNORANCE.powi(2) }
+}
+
+fn spread(deviation: f64) -> Matrix3<f64> {
+    Matrix3::identity() * deviation.powi(2)
+}
+
+/// Places and frames with alarms of a Kalman filter, which may have a detector.
+fn by_kalman(
+    flight: &TurningFlight,
+    deviation: f64,
+    density: f64,
+    mut detector: Option<NormalisedInnovation>,
+) -> (Vec<Point3<f64>>, Vec<usize>) {
+    let (mut state, spread) = (start(), spread(deviation));
+    let (mut places, mut alarms) = (Vec::new(), Vec::new());
+    for (frame, z) in flight.measured.iter().enumerate() {
+        state.time_update(STEP, density);
+        let nis = nis(&state, *z, &spread);
+        if detector.as_mut().zip(nis).is_some_and(|(detector, nis)| detector.see(nis, 3)) {
+            alarms.push(frame);
+            // Before the update, so that the filter relies on this measurement.
+            state.reinitialise(IGNORANCE, IGNORANCE);
+        }
+        update(&mut state, *z, &spread);
+        places.push(state.position());
+    }
+    (places, alarms)
+}
+
+/// The same of the paper's filter.
+fn by_smoothed_residual(
+    flight: &TurningFlight,
+    deviation: f64,
+    window: usize,
+) -> (Vec<Point3<f64>>, Vec<usize>) {
+    let (mut state, spread) = (start(), spread(deviation));
+    let mut detector = SmoothedResidual::new(window, SCALE);
+    let (mut places, mut alarms) = (Vec::new(), Vec::new());
+    for (frame, z) in flight.measured.iter().enumerate() {
+        state.time_update(STEP, LOW_DENSITY);
+        let alarm = detector.see((z - state.position()) / deviation);
+        update(&mut state, *z, &spread);
+        if alarm {
+            alarms.push(frame);
+            // In place of the updated covariance (Kalinov 2019, eqs. 8 and 9).
+            state.reinitialise(IGNORANCE, IGNORANCE);
+        }
+        places.push(state.position());
+    }
+    (places, alarms)
 }
 
 fn nis(state: &KinematicState, measured: Point3<f64>, spread: &Matrix3<f64>) -> Option<f64> {
@@ -343,13 +364,6 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             table.extend(rows);
         }
     }
-    let table = |name, title: &str, y, rows| Table {
-        name,
-        title: title.to_owned(),
-        x: "noise, m",
-        y,
-        rows,
-    };
     let [errors, ratios, alarms] = tables;
     vec![
         table(
@@ -361,4 +375,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         table("manoeuvre-ratio", "The same over all axes, over another filter's", "ratio", ratios),
         table("manoeuvre-alarm", "Alarms after turns (Kalinov 2019)", "", alarms),
     ]
+}
+
+fn table(name: &'static str, title: &str, y: &'static str, rows: Vec<TableRow>) -> Table {
+    Table { name, title: title.to_owned(), x: "noise, m", y, rows }
 }

@@ -44,25 +44,22 @@ impl PaperSite {
 
     /// The cameras, with a field of view that no target leaves.
     pub fn cameras(&self) -> Result<Vec<Camera>, GeometryError> {
-        let elevation = self.elevation.to_radians();
-        let camera = |azimuth: f64| {
-            let azimuth = azimuth.to_radians();
-            let level = elevation.cos();
-            let sight = Vector3::new(level * azimuth.cos(), level * azimuth.sin(), elevation.sin());
-            let intrinsics = Intrinsics {
-                size: ImageSize { width: 4000, height: 4000 },
-                fx: 800.0,
-                fy: 800.0,
-                cx: 1999.5,
-                cy: 1999.5,
-                distortion: Distortion::None,
-            };
-            Camera::new(
-                intrinsics,
-                Pose::looking_at(Point3::from(sight * -RANGE), Point3::origin())?,
-            )
+        self.azimuths.into_iter().map(|azimuth| self.camera(azimuth)).collect()
+    }
+
+    fn camera(&self, azimuth: f64) -> Result<Camera, GeometryError> {
+        let (azimuth, elevation) = (azimuth.to_radians(), self.elevation.to_radians());
+        let level = elevation.cos();
+        let sight = Vector3::new(level * azimuth.cos(), level * azimuth.sin(), elevation.sin());
+        let intrinsics = Intrinsics {
+            size: ImageSize { width: 4000, height: 4000 },
+            fx: 800.0,
+            fy: 800.0,
+            cx: 1999.5,
+            cy: 1999.5,
+            distortion: Distortion::None,
         };
-        self.azimuths.into_iter().map(camera).collect()
+        Camera::new(intrinsics, Pose::looking_at(Point3::from(sight * -RANGE), Point3::origin())?)
     }
 }
 
