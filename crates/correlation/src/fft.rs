@@ -42,19 +42,20 @@ impl Size {
     /// The smallest fast size that holds this many columns and rows: multiples of 16 with no prime
     /// factor above 5 are twice as fast as awkward sides.
     pub(crate) fn holding(width: usize, height: usize) -> Self {
-        let good = |side: usize| {
-            let mut side = side.next_multiple_of(16);
-            while !is_smooth(side) {
-                side += 16;
-            }
-            side
-        };
-        Self { width: good(width), height: good(height) }
+        Self { width: fast_side(width), height: fast_side(height) }
     }
 
     pub(crate) fn area(self) -> usize {
         self.width * self.height
     }
+}
+
+fn fast_side(least: usize) -> usize {
+    let mut side = least.next_multiple_of(16);
+    while !is_smooth(side) {
+        side += 16;
+    }
+    side
 }
 
 /// Whether a number has no prime factor above 5.
