@@ -21,18 +21,20 @@ use crate::AxisMeasurement;
 /// ```
 pub fn normal_score<const N: usize>(value: f64, parts: [(f64, AxisMeasurement); N]) -> f64 {
     let total: f64 = parts.iter().map(|(weight, _)| weight).sum();
-    let beyond = |sign: f64| -> f64 {
-        // P(X > value) for sign +1 and P(X < value) for -1: sum of w_i erfc(z_i / sqrt 2) / 2.
-        let tail = |(weight, part): &(f64, AxisMeasurement)| {
-            let off = sign * (value - part.position) / part.variance.sqrt();
-            weight * 0.5 * erfc(off / std::f64::consts::SQRT_2)
-        };
-        parts.iter().map(tail).sum::<f64>() / total
-    };
-    let (above, below) = (beyond(1.0), beyond(-1.0));
+    let (above, below) = (beyond(value, 1.0, &parts) / total, beyond(value, -1.0, &parts) / total);
     // The inverse normal distribution of the smaller tail, which has kept its digits. Tails below
     // the smallest positive number give the same score.
     let score =
         std::f64::consts::SQRT_2 * erfc_inv((2.0 * above.min(below)).clamp(f64::MIN_POSITIVE, 1.0));
     if above < below { score } else { -score }
+}
+
+/// P(X > value) for sign +1 and P(X < value) for -1, times the sum of the weights.
+fn beyond(value: f64, sign: f64, parts: &[(f64, AxisMeasurement)]) -> f64 {
+    // The sum of w_i erfc(z_i / sqrt 2) / 2.
+    let tail = |(weight, part): &(f64, AxisMeasurement)| {
+        let off = sign * (value - part.position) / part.variance.sqrt();
+        weight * 0.5 * erfc(off / std::f64::consts::SQRT_2)
+    };
+    parts.iter().map(tail).sum()
 }
