@@ -43,26 +43,7 @@ pub struct SimulatedCamera {
 
 impl World {
     pub(crate) fn new(scene: &Scene) -> Result<Self, SceneError> {
-        let camera = |(index, description): (usize, &SceneCamera)| {
-            let impossible =
-                |source| SceneError::Camera { camera: description.name.clone(), source };
-            let camera = description.camera().map_err(impossible)?;
-            let mount = description.mount.as_ref();
-            let pan_tilt = mount.map(|mount| mount.pan_tilt(*camera.pose())).transpose();
-            // Each camera has its own random numbers, derived from the one seed.
-            let seed = scene.seed.wrapping_mul(1_000_003).wrapping_add(index as u64);
-            let [width, height] = description.size_px.map(|side| side as usize);
-            Ok(SimulatedCamera {
-                description: description.clone(),
-                camera,
-                pan_tilt: pan_tilt.map_err(impossible)?,
-                sky: sky(width, height, seed),
-                panorama: mount.map(|_| Panorama::new(seed)),
-                seed,
-                targets: scene.targets.clone(),
-                duration_s: scene.duration_s,
-            })
-        };
+        let camera = |(index, description)| SimulatedCamera::new(scene, index, description);
         let cameras = scene.cameras.iter().enumerate().map(camera).collect::<Result<_, _>>()?;
         Ok(Self { targets: scene.targets.clone(), cameras, duration_s: scene.duration_s })
     }
@@ -98,6 +79,26 @@ fn state(target: &SceneTarget, t: f64) -> TargetState {
 }
 
 impl SimulatedCamera {
+    fn new(scene: &Scene, index: usize, description: &SceneCamera) -> Result<Self, SceneError> {
+        let impossible = |source| SceneError::Camera { camera: description.name.clone(), source };
+        let camera = description.camera().map_err(impossible)?;
+        let mount = description.mount.as_ref();
+        let pan_tilt = mount.map(|mount| mount.pan_tilt(*camera.pose())).transpose();
+        // Each camera has its own random numbers, derived from the one seed.
+        let seed = scene.seed.wrapping_mul(1_000_003).wrapping_add(index as u64);
+        let [width, height] = description.size_px.map(|side| side as usize);
+        Ok(Self {
+            description: description.clone(),
+            camera,
+            pan_tilt: pan_tilt.map_err(impossible)?,
+            sky: sky(width, height, seed),
+            panorama: mount.map(|_| Panorama::new(seed)),
+            seed,
+            targets: scene.targets.clone(),
+            duration_s: scene.duration_s,
+        })
+    }
+
     /// Its name.
     pub fn name(&self) -> &CameraName {
         &self.description.name
