@@ -1,7 +1,7 @@
 //! Detection of what looks like a star in a picture.
 
 use crossfix_geometry::Pixel;
-use tetra3::{CentroidExtractionConfig, DeblendMode, extract_centroids_from_raw};
+use tetra3::{Centroid, CentroidExtractionConfig, DeblendMode, extract_centroids_from_raw};
 
 use crate::StarError;
 
@@ -42,15 +42,19 @@ pub fn find_spots(picture: &Picture<'_>) -> Result<Vec<Spot>, StarError> {
     };
     let found = extract_centroids_from_raw(brightness, width, height, &config)
         .map_err(|error| StarError::Picture(error.to_string()))?;
+    let mut spots: Vec<Spot> =
+        found.centroids.iter().map(|centroid| spot(centroid, width, height)).collect();
+    spots.sort_by(|a, b| b.brightness.total_cmp(&a.brightness));
+    Ok(spots)
+}
+
+fn spot(centroid: &Centroid, width: u32, height: u32) -> Spot {
     // The library counts from the middle of the image, pixels here from the middle of the first.
-    let spot = |centroid: &tetra3::Centroid| Spot {
+    Spot {
         pixel: Pixel::new(
             f64::from(centroid.x) + (f64::from(width) - 1.0) / 2.0,
             f64::from(centroid.y) + (f64::from(height) - 1.0) / 2.0,
         ),
         brightness: centroid.mass.map_or(0.0, f64::from),
-    };
-    let mut spots: Vec<Spot> = found.centroids.iter().map(spot).collect();
-    spots.sort_by(|a, b| b.brightness.total_cmp(&a.brightness));
-    Ok(spots)
+    }
 }
