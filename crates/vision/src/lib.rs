@@ -33,6 +33,7 @@ mod detector;
 mod figure;
 mod finding;
 mod fit;
+mod followed_target;
 mod frame;
 mod gate;
 mod hypotheses;
@@ -52,7 +53,6 @@ mod search;
 mod search_memory;
 mod sighting;
 mod state;
-mod target;
 mod tracker;
 
 use std::fmt;

@@ -2,10 +2,10 @@
 
 use crate::PixelBox;
 use crate::fit::TargetFit;
+use crate::followed_target::Target;
 use crate::frame::{NewImage, TargetStep};
 use crate::scratch::Scratch;
 use crate::search::LEAST_RATIO;
-use crate::target::Target;
 
 /// Largest ratio of the sides of what is found to the target's, either way: outlines lose what is
 /// as bright as the sky behind it. With half of it a panning camera's target is right in 96.5 % of

@@ -4,11 +4,11 @@ use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
 use crate::detector::Detector;
+use crate::followed_target::Target;
 use crate::frame::{Measurement, NewImage, TargetStep};
 use crate::paper::PaperTarget;
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
-use crate::target::Target;
 use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
 /// Bounds of the time between images, s; other intervals are clamped to them: after a longer pause
