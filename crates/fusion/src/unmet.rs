@@ -28,9 +28,9 @@ const LEAST_SHARE: f64 = 0.8;
 const SOMETHING_S: f64 = 1.0;
 /// Exposures further apart than this are not compared, s.
 const MAX_APART_S: f64 = 0.5;
-/// Cameras stand in the same place if their distance is at most this many standard deviations of
-/// their places: what they see has no range then.
-const SIGMAS: f64 = 3.0;
+/// Cameras that are nearer to each other than this stand in the same place, m: what they see has no
+/// range. No survey is as good; a pose that was copied is the same to the last digit.
+const SAME_PLACE_M: f64 = 1e-3;
 /// Most lines of one exposure that are compared: time is bounded.
 const MAX_LINES: usize = 30;
 /// Most image tracks of a camera that are remembered: memory is bounded.
@@ -60,7 +60,7 @@ pub enum UnmetLines {
     },
     /// They meet, but not as any target's motion would explain.
     Unsteady,
-    /// They begin in the same place, as far as the poses tell.
+    /// They begin in the same place.
     Together,
 }
 
@@ -108,7 +108,7 @@ impl fmt::Display for WhyNothing {
 
 /// Result of one comparison.
 #[derive(Clone, Copy, Debug)]
-enum ComparisonResult {
+enum PairResult {
     /// One of the cameras saw nothing.
     Nothing,
     /// The cameras stand in the same place.
@@ -116,17 +116,18 @@ enum ComparisonResult {
     Lines(Passing),
 }
 
-/// The kinds of results by which a reason is found; of two that are equally frequent, the later.
+/// What two cameras' lines do, without figures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
+enum PairFinding {
+    Together,
     Nowhere,
     Apart,
     Close,
-    Together,
 }
 
-impl Kind {
-    const ALL: [Self; 4] = [Self::Nowhere, Self::Apart, Self::Close, Self::Together];
+impl PairFinding {
+    /// Of two that are equally frequent, the later is the reason: what tells more comes later.
+    const ALL: [Self; 4] = [Self::Together, Self::Nowhere, Self::Apart, Self::Close];
 
     fn counter(self) -> &'static str {
         match self {
@@ -138,15 +139,15 @@ impl Kind {
     }
 }
 
-impl ComparisonResult {
+impl PairResult {
     /// `None` if one of the cameras saw nothing.
-    fn kind(self) -> Option<Kind> {
+    fn finding(self) -> Option<PairFinding> {
         match self {
             Self::Nothing => None,
-            Self::Together => Some(Kind::Together),
-            Self::Lines(Passing::Nowhere) => Some(Kind::Nowhere),
-            Self::Lines(Passing::Apart { .. }) => Some(Kind::Apart),
-            Self::Lines(Passing::Close) => Some(Kind::Close),
+            Self::Together => Some(PairFinding::Together),
+            Self::Lines(Passing::Nowhere) => Some(PairFinding::Nowhere),
+            Self::Lines(Passing::Apart { .. }) => Some(PairFinding::Apart),
+            Self::Lines(Passing::Close) => Some(PairFinding::Close),
         }
     }
 }
@@ -164,24 +165,24 @@ struct LatelySeen {
 #[derive(Clone, Debug)]
 struct PairComparisons {
     time: Timestamp,
-    shown: VecDeque<ComparisonResult>,
+    shown: VecDeque<PairResult>,
 }
 
 impl PairComparisons {
     /// Whether both cameras have seen something in most comparisons, and these are enough.
     fn is_steady(&self) -> bool {
-        let both = self.shown.iter().filter(|shown| shown.kind().is_some()).count();
+        let both = self.shown.iter().filter(|shown| shown.finding().is_some()).count();
         self.shown.len() * 2 >= REMEMBERED && both as f64 >= LEAST_SHARE * self.shown.len() as f64
     }
 
-    fn count(&self, kind: Kind) -> usize {
-        self.shown.iter().filter(|shown| shown.kind() == Some(kind)).count()
+    fn count(&self, wanted: PairFinding) -> usize {
+        self.shown.iter().filter(|shown| shown.finding() == Some(wanted)).count()
     }
 
     /// The median distance at which the lines miss each other, m.
     fn median_miss(&self) -> Option<f64> {
-        let miss = |shown: &ComparisonResult| match shown {
-            ComparisonResult::Lines(Passing::Apart { by_m }) => Some(*by_m),
+        let miss = |shown: &PairResult| match shown {
+            PairResult::Lines(Passing::Apart { by_m }) => Some(*by_m),
             _ => None,
         };
         let mut misses: Vec<f64> = self.shown.iter().filter_map(miss).collect();
@@ -248,7 +249,7 @@ impl Unmet {
                 continue;
             }
             let shown = compared(&lines, &seen.lines, &self.passings);
-            counted.extend(shown.kind().map(Kind::counter));
+            counted.extend(shown.finding().map(PairFinding::counter));
             pair.time = now;
             pair.shown.push_back(shown);
             if pair.shown.len() > REMEMBERED {
@@ -302,27 +303,29 @@ impl Unmet {
     fn conclusion(&self) -> Option<WhyNothing> {
         let steady: Vec<(&[CameraName; 2], &PairComparisons)> =
             self.pairs.iter().filter(|(_, pair)| pair.is_steady()).collect();
-        let total = |kind: &Kind| steady.iter().map(|(_, pair)| pair.count(*kind)).sum::<usize>();
-        let most = Kind::ALL.into_iter().filter(|kind| total(kind) > 0).max_by_key(total)?;
+        let total = |finding: &PairFinding| {
+            steady.iter().map(|(_, pair)| pair.count(*finding)).sum::<usize>()
+        };
+        let most =
+            PairFinding::ALL.into_iter().filter(|finding| total(finding) > 0).max_by_key(total)?;
         let (cameras, pair) = steady.into_iter().max_by_key(|(_, pair)| pair.count(most))?;
         let lines = match most {
-            Kind::Nowhere => UnmetLines::Nowhere { max_range_m: self.max_range_m },
-            Kind::Apart => UnmetLines::Apart { by_m: pair.median_miss()? },
-            Kind::Close => UnmetLines::Unsteady,
-            Kind::Together => UnmetLines::Together,
+            PairFinding::Nowhere => UnmetLines::Nowhere { max_range_m: self.max_range_m },
+            PairFinding::Apart => UnmetLines::Apart { by_m: pair.median_miss()? },
+            PairFinding::Close => UnmetLines::Unsteady,
+            PairFinding::Together => UnmetLines::Together,
         };
         Some(WhyNothing { cameras: cameras.clone(), lines })
     }
 }
 
 /// What the two closest lines of two cameras do.
-fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> ComparisonResult {
+fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> PairResult {
     let (Some(first), Some(second)) = (one.first(), other.first()) else {
-        return ComparisonResult::Nothing;
+        return PairResult::Nothing;
     };
-    let unsure_m = first.origin_sd_m + second.origin_sd_m;
-    if (first.line.origin - second.line.origin).norm() <= SIGMAS * unsure_m {
-        return ComparisonResult::Together;
+    if (first.line.origin - second.line.origin).norm() < SAME_PLACE_M {
+        return PairResult::Together;
     }
     let all = one.iter().flat_map(|first| other.iter().map(|second| passings.of(first, second)));
     let closeness = |passing: &Passing| match passing {
@@ -331,5 +334,5 @@ fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> Comp
         Passing::Nowhere => f64::INFINITY,
     };
     let closest = all.min_by(|a, b| closeness(a).total_cmp(&closeness(b)));
-    closest.map_or(ComparisonResult::Nothing, ComparisonResult::Lines)
+    closest.map_or(PairResult::Nothing, PairResult::Lines)
 }

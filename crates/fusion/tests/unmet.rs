@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Eye, Scene, found, fusion_of, site, straight};
+use common::{Eye, Scene, calibration, found, fusion_of, site, straight};
 use crossfix_fusion::{Fusion, FusionConfig, UnmetLines};
 use crossfix_message::BearingFrame;
 use nalgebra::{Rotation3, Vector3};
@@ -121,4 +121,24 @@ fn cameras_whose_poses_are_copies_are_said() {
     let why = fusion.why_nothing().unwrap();
     assert_eq!(why.lines, UnmetLines::Together);
     assert!(why.to_string().ends_with("check whether a pose was copied"), "{why}");
+}
+
+#[test]
+fn cameras_whose_places_are_hardly_known_are_not_taken_for_copies() {
+    // A phone's position: 5 m. 260 m apart the places are still two, and the turned camera is said.
+    let scene = two_cameras();
+    let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
+    for eye in &scene.eyes {
+        fusion.calibrate(&calibration(eye).with_pose_sd(0.001, 5.0)).unwrap();
+    }
+    for mut frame in scene.frames(3) {
+        for track in frame.tracks.iter_mut().filter(|_| frame.camera == "b") {
+            let turned =
+                Rotation3::from_euler_angles(0.4, 0.0, 0.0) * Vector3::from(track.bearing.unwrap());
+            track.bearing = Some(turned.into());
+        }
+        fusion.ingest(&frame);
+    }
+    let why = fusion.why_nothing().unwrap();
+    assert!(matches!(why.lines, UnmetLines::Apart { by_m } if by_m > 30.0), "{why:?}");
 }
