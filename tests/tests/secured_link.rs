@@ -43,6 +43,9 @@ fn a_secured_link_is_not_broken_by_what_goes_both_ways() {
     let east: CameraName = "east".parse().unwrap();
     let (fusion, agent, viewer) =
         (open(Role::Fusion(None)), open(Role::Camera(east.clone())), open(Role::Observer));
+    for link in [&fusion, &agent, &viewer] {
+        assert!(link.certificate().is_some(), "the link is secured");
+    }
     let bearings = agent.publisher(Channel::Bearings(east.clone()), Delivery::Every).unwrap();
     let tracks = fusion.publisher(Channel::Tracks, Delivery::Every).unwrap();
     let in_bearings = fusion.subscribe(&[fusion.key(Channel::Bearings(east)).to_string()]).unwrap();

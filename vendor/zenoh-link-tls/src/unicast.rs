@@ -11,6 +11,8 @@
 // Contributors:
 //   ZettaScale Zenoh Team, <zenoh@zettascale.tech>
 //
+// Changed for Crossfix: see the README beside this folder.
+//
 #[cfg(all(feature = "uring", target_os = "linux"))]
 use std::os::fd::RawFd;
 use std::{
@@ -145,22 +147,32 @@ impl LinkUnicastTls {
         }
     }
 
-    // Locks the stream for one poll. A panic of rustls in another task ends that task's link.
+    // Locks the stream for one poll. A panic in another task's poll poisons nothing: that task's link ends.
     fn lock(&self) -> MutexGuard<'_, TlsStream<TcpStream>> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     async fn write_some(&self, buffer: &[u8]) -> std::io::Result<usize> {
-        poll_fn(|cx| Pin::new(&mut *self.lock()).poll_write(cx, buffer)).await
+        loop {
+            match poll_fn(|cx| Pin::new(&mut *self.lock()).poll_write(cx, buffer)).await {
+                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+                done => return done,
+            }
+        }
     }
 
     async fn read_some(&self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        poll_fn(|cx| {
-            let mut buffer = ReadBuf::new(buffer);
-            let polled = Pin::new(&mut *self.lock()).poll_read(cx, &mut buffer);
-            polled.map_ok(|()| buffer.filled().len())
-        })
-        .await
+        loop {
+            let read = poll_fn(|cx| {
+                let mut buffer = ReadBuf::new(buffer);
+                let polled = Pin::new(&mut *self.lock()).poll_read(cx, &mut buffer);
+                polled.map_ok(|()| buffer.filled().len())
+            });
+            match read.await {
+                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+                done => return done,
+            }
+        }
     }
 
     async fn close(&self) -> ZResult<()> {
