@@ -259,6 +259,7 @@ impl FitEquations {
         let mut right = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
         // Without scale and turn their rows are empty: any information there keeps the matrix
         // regular.
+        let information = normal;
         let shift_only = options.freedom == Freedom::Shift;
         let stiff = if shift_only { energy } else { options.stiffness * energy };
         for i in 0..5 {
@@ -273,18 +274,20 @@ impl FitEquations {
         let solution = solved.solve(&right);
         let gain = solution[0];
         fit.gain = gain;
-        // Residual sum of squares over the pixels less the fitted parameters: with the image r it
-        // is r'r - x'J'r for the x of least squares. A given contrast is not: there it is
-        // r'r - 2 g m'r + g^2 m'm with the model m and the gain g alone.
-        let freedoms = if shift_only { 4.0 } else { 6.0 };
+        // Residual sum of squares over the pixels less the fitted parameters and the mean. With the
+        // image r it is r'r - 2 x'J'r + x'J'J x for any x, and r'r - x'J'r for that of least
+        // squares, which it is not where the contrast is given.
         let fitted = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
-        let explained = if options.contrast.is_some() {
-            gain * (2.0 * fitted[0] - gain * energy)
-        } else {
-            solution.dot(&fitted)
+        let parameters = if shift_only { 4.0 } else { 6.0 };
+        let (explained, parameters) = match options.contrast {
+            Some(_) => (
+                2.0 * solution.dot(&fitted) - (information * solution).dot(&solution),
+                parameters - 1.0,
+            ),
+            None => (solution.dot(&fitted), parameters),
         };
         fit.residual_variance =
-            ((p[5][5] - explained) / (fit.pixels as f64 - freedoms).max(1.0)).max(0.0);
+            ((p[5][5] - explained) / (fit.pixels as f64 - parameters).max(1.0)).max(0.0);
         if gain <= 0.0 || !gain.is_finite() {
             return None;
         }
@@ -368,7 +371,7 @@ mod tests {
         let mut image = spot(40, 40, 20.0, 20.0, 1.0, 0.0);
         image.samples_mut().iter_mut().for_each(|s| *s *= 0.7);
         let options = FitOptions { contrast: Some(1.0), ..FitOptions::default() };
-        let fit = Fitter::default().fit(&image, &reference(), 13.0, 14.0, options);
+        let fit = Fitter::default().fit(&image, &reference(), 13.4, 13.7, options);
         // By hand: three tenths of the spot are left, but for their mean, inside its edge.
         let spot: Vec<f64> = (-5..=5)
             .flat_map(|y| (-6..=6).map(move |x| (f64::from(x), f64::from(y))))
@@ -376,9 +379,9 @@ mod tests {
             .collect();
         let (count, mean) = (spot.len() as f64, spot.iter().sum::<f64>() / spot.len() as f64);
         let energy: f64 = spot.iter().map(|value| (value - mean).powi(2)).sum();
-        let expected = 0.09 * energy / (count - 4.0);
         // The model is a spline whose filter is cut off at five samples, which changes the model's
         // energy by half a percent, and these residuals by three times that.
+        let expected = 0.09 * energy / (count - 3.0);
         assert!((fit.residual_variance / expected - 1.0).abs() < 0.02, "{fit:?}, {expected}");
     }
 

@@ -12,7 +12,7 @@ use anyhow::Context;
 use crossfix_message::Timestamp;
 use crossfix_outlet::Outlet;
 
-use super::HeardSince;
+use super::OutletNews;
 use super::tls::{TlsClient, TlsStream};
 use crate::pace::wall_seconds;
 
@@ -219,12 +219,12 @@ impl Carrier {
     ///
     /// # Errors
     /// If trying again is useless: a file or a pipe that takes no more.
-    pub fn say(&mut self, outlet: &mut dyn Outlet, heard: &mut HeardSince) -> anyhow::Result<()> {
+    pub fn say(&mut self, outlet: &mut dyn Outlet, heard: &mut OutletNews) -> anyhow::Result<()> {
         let said = self.try_to_say(outlet, heard);
         self.mind(said)
     }
 
-    fn try_to_say(&mut self, outlet: &mut dyn Outlet, heard: &mut HeardSince) -> io::Result<()> {
+    fn try_to_say(&mut self, outlet: &mut dyn Outlet, heard: &mut OutletNews) -> io::Result<()> {
         if self.way.is_none() {
             if self.tried_at.is_some_and(|at| at.elapsed() < RETRY) {
                 return Ok(());

@@ -154,7 +154,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let subscription = link.subscribe(&[channels.as_slice(), &[calibrations]].concat())?;
     tracing::info!("telling {} where the targets of `{site}` are", args.to);
 
-    let mut heard = HeardSince {
+    let mut heard = OutletNews {
         situation: Situation::new(site, anchor),
         tracks_at: Instant::now(),
         events: Vec::new(),
@@ -183,7 +183,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 /// What the site has published since the outlet last sent something.
-struct HeardSince {
+struct OutletNews {
     situation: Situation,
     /// When the fusion centre last published tracks.
     tracks_at: Instant,
@@ -191,7 +191,7 @@ struct HeardSince {
     repeats: Repeats,
 }
 
-impl HeardSince {
+impl OutletNews {
     /// Positions of all targets now.
     fn snapshot(&mut self) -> Option<Snapshot> {
         self.situation.snapshot(self.tracks_at.elapsed().as_secs_f64())
@@ -232,7 +232,11 @@ impl HeardSince {
             Channel::Events => {
                 self.events.extend(decode::<TrackEvent>(&received.data).ok());
                 let too_many = self.events.len().saturating_sub(MOST_EVENTS);
-                self.events.drain(..too_many);
+                if self.events.drain(..too_many).next().is_some() {
+                    self.repeats.warn("events", received.at, || {
+                        format!("more than {MOST_EVENTS} events wait: the oldest is dropped")
+                    });
+                }
             }
             _ => {}
         }
