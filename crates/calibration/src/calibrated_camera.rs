@@ -188,13 +188,14 @@ impl ClockCorrection {
                 let between = |k: usize| before[k] + (next[k] - before[k]) * share;
                 (between(1), between(2))
             }
-            (Some(last), None) => self.beyond(last, own_s),
-            (None, Some(first)) => self.beyond(first, own_s),
+            (Some(last), None) => self.extrapolated(last, own_s),
+            (None, Some(first)) => self.extrapolated(first, own_s),
             (None, None) => (0.0, 0.0),
         }
     }
 
-    fn beyond(&self, knot: &[f64; 3], own_s: f64) -> (f64, f64) {
+    /// The correction before the first knot or after the last.
+    fn extrapolated(&self, knot: &[f64; 3], own_s: f64) -> (f64, f64) {
         let away = own_s - knot[0];
         // Beyond the knots: the end's variance, the rate's times away^2, and the random walk's
         // times |away|.

@@ -117,7 +117,7 @@ pub fn find<T>(
 
 /// Signals that the search is over, so the rest need not be read.
 #[derive(Debug, thiserror::Error)]
-#[error("found")]
+#[error("the search is over")]
 struct SearchOver;
 
 /// An error of the handler's.

@@ -12,11 +12,11 @@ const MAX_KINDS: usize = 1000;
 /// so that whoever can cause a warning cannot fill a disk with it.
 #[derive(Debug, Default)]
 pub struct Repeats {
-    kinds: BTreeMap<String, Repeat>,
+    kinds: BTreeMap<String, RepeatedWarning>,
 }
 
 #[derive(Debug)]
-struct Repeat {
+struct RepeatedWarning {
     said: Instant,
     /// Number of warnings since, and the text of the first of them.
     more: u64,
@@ -42,7 +42,10 @@ impl Repeats {
 
     /// Logs all counts that have not been logged yet, at the end.
     pub fn end(&mut self) {
-        self.kinds.values_mut().filter_map(Repeat::rest).for_each(|line| tracing::warn!("{line}"));
+        self.kinds
+            .values_mut()
+            .filter_map(RepeatedWarning::rest)
+            .for_each(|line| tracing::warn!("{line}"));
     }
 
     fn line(&mut self, kind: &str, now: Instant, text: impl FnOnce() -> String) -> Option<String> {
@@ -56,12 +59,13 @@ impl Repeats {
             return known.due(now);
         }
         let line = text();
-        self.kinds.insert(kind.to_owned(), Repeat { said: now, more: 0, first: String::new() });
+        self.kinds
+            .insert(kind.to_owned(), RepeatedWarning { said: now, more: 0, first: String::new() });
         Some(line)
     }
 }
 
-impl Repeat {
+impl RepeatedWarning {
     fn due(&mut self, now: Instant) -> Option<String> {
         if now.saturating_duration_since(self.said) < PERIOD {
             return None;

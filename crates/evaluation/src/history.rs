@@ -16,12 +16,12 @@ const LATELY_S: f64 = 1.0;
 #[derive(Clone, Debug, Default)]
 pub struct TrackHistory {
     /// Statements on each track, by time.
-    tracks: BTreeMap<u64, BTreeMap<Timestamp, SaidTrack>>,
+    tracks: BTreeMap<u64, BTreeMap<Timestamp, ReportedTrack>>,
     times: BTreeSet<Timestamp>,
 }
 
 #[derive(Clone, Debug)]
-struct SaidTrack {
+struct ReportedTrack {
     status: TrackState,
     /// When each camera gave its newest bearing.
     bearings: Vec<Timestamp>,
@@ -47,7 +47,7 @@ impl TrackHistory {
             let bearings =
                 track.residuals.iter().map(|r| Timestamp::from_nanos(r.time_ns)).collect();
             let (status, state) = (track.state(), state(track));
-            let said = SaidTrack { status, bearings, state, time_sd_s: frame.time_sd_s };
+            let said = ReportedTrack { status, bearings, state, time_sd_s: frame.time_sd_s };
             self.tracks.entry(track.id).or_default().insert(time, said);
         }
     }

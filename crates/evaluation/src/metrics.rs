@@ -177,7 +177,7 @@ impl ErrorSums {
 }
 
 #[derive(Clone, Debug, Default)]
-struct TruthTarget {
+struct TargetScore {
     sums: ErrorSums,
     instants: u64,
     last_track: Option<u64>,
@@ -219,7 +219,7 @@ impl Answers {
 pub struct Evaluator {
     cutoff: f64,
     instants: u64,
-    targets: BTreeMap<u64, TruthTarget>,
+    targets: BTreeMap<u64, TargetScore>,
     all: ErrorSums,
     false_instants: u64,
     answers: Answers,
@@ -342,7 +342,7 @@ impl Evaluator {
     }
 }
 
-fn target_report(id: u64, target: &TruthTarget) -> TargetReport {
+fn target_report(id: u64, target: &TargetScore) -> TargetReport {
     let sums = &target.sums;
     let [nees, position_nees, velocity_nees] = sums.nees();
     TargetReport {

@@ -15,13 +15,13 @@ use crate::cueing::Cueing;
 use crate::event_time::{EventBuffer, ExposureArrival, ReorderQueue};
 use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::site_time::{FrameDecision, SiteTime, moved};
 use crate::track::{Track, TrackId};
 use crate::tracker::{TrackChange, Tracker};
 use smoothing::Smoothing;
 
-use crate::uncertainty::{SharedNoise, pose_covariance_of_careful_survey};
+use crate::uncertainty::{CorrelatedNoise, pose_covariance_of_careful_survey};
 use crate::unmet::{Unmet, WhyNothing};
 use crate::{ConfigError, Counters, FusionConfig};
 
@@ -85,7 +85,7 @@ impl Fusion {
     /// [`ConfigError`] if a number of the configuration makes no sense.
     pub fn new(config: FusionConfig) -> Result<Self, ConfigError> {
         config.validate()?;
-        let motion = TrackMotion::new(&config.tracking)?;
+        let motion = MotionSetup::new(&config.tracking)?;
         Ok(Self {
             cameras: Cameras::new(config.tracking.coasting_after_s),
             buffer: EventBuffer::new(config.event_time.clone()),
@@ -115,9 +115,8 @@ impl Fusion {
         let is_declared = calibration.pose_covariance.is_some();
         let declared = calibration.pose_covariance;
         let pose_covariance = declared.unwrap_or_else(pose_covariance_of_careful_survey);
-        let lasting = calibration.lasting_noise.map_or(SharedNoise::NONE, |noise| SharedNoise {
-            sd_rad: noise.sd_rad,
-            time_s: noise.time_s,
+        let lasting = calibration.lasting_noise.map_or(CorrelatedNoise::NONE, |noise| {
+            CorrelatedNoise { sd_rad: noise.sd_rad, time_s: noise.time_s }
         });
         let known = KnownCamera {
             camera: calibration.camera,

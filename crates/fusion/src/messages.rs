@@ -3,7 +3,7 @@
 use crossfix_filter::KinematicState;
 use crossfix_message::{CameraResidual, Payload, Timestamp, TrackEvent, TrackState};
 
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::spatial::Quantity;
 use crate::track::{Track, TrackStatus};
 use crate::tracker::TrackChange;
@@ -24,7 +24,7 @@ pub(crate) fn event(change: TrackChange, time: Timestamp) -> TrackEvent {
 pub(crate) fn track(
     track: &Track,
     time: Timestamp,
-    motion: &TrackMotion,
+    motion: &MotionSetup,
 ) -> crossfix_message::Track {
     let now = track.predicted(time, motion);
     let state = match track.status {

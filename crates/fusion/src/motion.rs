@@ -13,7 +13,7 @@ pub(crate) const REINITIALISED_POSITION_SD: f64 = 1.0;
 
 /// The motion models of all tracks, and the detector that a new track gets.
 #[derive(Clone, Debug)]
-pub(crate) struct TrackMotion {
+pub(crate) struct MotionSetup {
     /// For tracks that several cameras see.
     models: MotionModels,
     /// For tracks that one camera alone sees: the motion along its sight line cannot be observed,
@@ -33,7 +33,7 @@ pub(crate) enum ManoeuvreDetector {
     Innovation(NormalisedInnovation),
 }
 
-impl TrackMotion {
+impl MotionSetup {
     pub(crate) fn new(config: &Tracking) -> Result<Self, ConfigError> {
         let single = MotionModels::single(config.acceleration_density);
         let (models, detector) = match config.manoeuvres {

@@ -2,7 +2,7 @@
 //! narrow enough that no number makes the fusion slow, or its sums too large or too small to be
 //! told apart.
 
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::{
     ConfigError, FlightModel, FusionConfig, InitiationMethod, Manoeuvres, SpatialSolver, Weighting,
 };
@@ -20,29 +20,29 @@ const fn range(key: &'static str, value: f64, least: f64, most: f64) -> Range {
 }
 
 /// A key and its number.
-type RangeKey = (&'static str, fn(&FusionConfig) -> f64);
+type NumberKey = (&'static str, fn(&FusionConfig) -> f64);
 
 // Keys that one method alone uses.
-const OF_EQUAL_WEIGHTS: &[RangeKey] = &[("bearings.equal_sd_rad", |c| c.bearings.equal_sd_rad)];
-const OF_PAIRS: &[RangeKey] = &[("initiation.pair_gate_m2", |c| c.initiation.pair_gate_m2)];
-const OF_GROUPING: &[RangeKey] =
+const OF_EQUAL_WEIGHTS: &[NumberKey] = &[("bearings.equal_sd_rad", |c| c.bearings.equal_sd_rad)];
+const OF_PAIRS: &[NumberKey] = &[("initiation.pair_gate_m2", |c| c.initiation.pair_gate_m2)];
+const OF_GROUPING: &[NumberKey] =
     &[("initiation.temporal_gate_m", |c| c.initiation.temporal_gate_m.unwrap_or(f64::NAN))];
-const OF_HYPOTHESES: &[RangeKey] = &[
+const OF_HYPOTHESES: &[NumberKey] = &[
     ("initiation.birth_density_per_m3", |c| c.initiation.birth_density_per_m3),
     ("initiation.pair_s", |c| c.initiation.pair_s),
 ];
-const OF_ONE_MODEL: &[RangeKey] =
+const OF_ONE_MODEL: &[NumberKey] =
     &[("tracking.acceleration_density", |c| c.tracking.acceleration_density)];
-const OF_MODELS: &[RangeKey] = &[
+const OF_MODELS: &[NumberKey] = &[
     ("tracking.switching_rate_per_s", |c| c.tracking.switching_rate_per_s),
     ("tracking.calming_rate_per_s", |c| c.tracking.calming_rate_per_s),
     ("tracking.restlessness_prior_s", |c| c.tracking.restlessness_prior_s),
 ];
-const OF_SMOOTHED_RESIDUAL: &[RangeKey] = &[
+const OF_SMOOTHED_RESIDUAL: &[NumberKey] = &[
     ("tracking.residual_window", |c| c.tracking.residual_window as f64),
     ("tracking.residual_scale", |c| c.tracking.residual_scale),
 ];
-const OF_INNOVATION: &[RangeKey] = &[
+const OF_INNOVATION: &[NumberKey] = &[
     ("tracking.innovation_window", |c| c.tracking.innovation_window as f64),
     ("tracking.innovation_false_alarm", |c| c.tracking.innovation_false_alarm),
 ];
@@ -160,7 +160,7 @@ impl FusionConfig {
         let key = "tracking.models.acceleration_density";
         let density = |model: &FlightModel| range(key, model.acceleration_density, 0.0, 1e6);
         self.tracking.models.iter().map(density).try_for_each(|range| range.check())?;
-        TrackMotion::new(&self.tracking).map(drop)
+        MotionSetup::new(&self.tracking).map(drop)
     }
 
     fn probabilities(&self) -> Result<(), ConfigError> {

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use crossfix_filter::Gate;
 
 use crate::cameras::KnownCamera;
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::track::{Track, TrackId};
 use crate::visibility::log_missed;
 use crate::{Exposure, Tracking};
@@ -42,7 +42,7 @@ pub(crate) struct Reacquisition {
 pub(crate) struct ReacquisitionContext<'a> {
     pub(crate) exposure: &'a Exposure,
     pub(crate) known: &'a KnownCamera,
-    pub(crate) motion: &'a TrackMotion,
+    pub(crate) motion: &'a MotionSetup,
     pub(crate) config: &'a Tracking,
     pub(crate) gate: Gate,
     pub(crate) max_range_m: f64,

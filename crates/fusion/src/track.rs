@@ -14,7 +14,7 @@ use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Point3};
 
 use crate::cueing::CueTarget;
 use crate::motion::{
-    ManoeuvreDetector, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD, TrackMotion,
+    ManoeuvreDetector, MotionSetup, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD,
 };
 use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
 use crate::uncertainty::CameraUncertainty;
@@ -140,7 +140,7 @@ impl Track {
     pub(crate) fn start<'a>(
         fix: &Fix,
         lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine, CameraUncertainty)>,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Self {
         let mut track = Self {
             id: TrackId(0),
@@ -179,7 +179,7 @@ impl Track {
     pub(crate) fn start_alone(
         fix: &Fix,
         (camera, line, uncertainty): (&CameraName, &TimedLine, CameraUncertainty),
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Self {
         let mut track = Self::start(fix, [(camera, line, uncertainty)], motion);
         (track.held, track.ranged, track.follower) = (false, false, Some(line.line.origin));
@@ -253,7 +253,7 @@ impl Track {
     }
 
     /// Position and velocity expected at another time.
-    pub(crate) fn predicted(&self, time: Timestamp, motion: &TrackMotion) -> KinematicState {
+    pub(crate) fn predicted(&self, time: Timestamp, motion: &MotionSetup) -> KinematicState {
         self.imm.predicted(time.seconds_since(self.updated), motion.models(self.ranged))
     }
 
@@ -264,7 +264,7 @@ impl Track {
     }
 
     /// The track's state now and for the seconds ahead, for cueing.
-    pub(crate) fn known(&self, now: Timestamp, motion: &TrackMotion) -> CueTarget {
+    pub(crate) fn known(&self, now: Timestamp, motion: &MotionSetup) -> CueTarget {
         let of = Cued { track_id: self.id.0, ..Default::default() };
         let seen_from = self.follower.filter(|_| !self.held);
         CueTarget::new(of, now, seen_from, |time| self.predicted(time, motion))
@@ -276,13 +276,13 @@ impl Track {
     }
 
     /// How many other cameras than this one have lately seen the target.
-    pub(crate) fn others_than(&self, camera: &CameraName, motion: &TrackMotion) -> usize {
+    pub(crate) fn others_than(&self, camera: &CameraName, motion: &MotionSetup) -> usize {
         let lately = |ties: &Ties| ties.has_seen_lately(self.updated, motion.holding_s);
         self.ties.iter().filter(|(name, ties)| lately(ties) && *name != camera).count()
     }
 
     /// Whether a camera has lately given the track a bearing.
-    fn is_followed_by(&self, camera: &CameraName, motion: &TrackMotion) -> bool {
+    fn is_followed_by(&self, camera: &CameraName, motion: &MotionSetup) -> bool {
         self.ties
             .get(camera)
             .is_some_and(|ties| ties.has_seen_lately(self.updated, motion.holding_s))
@@ -290,7 +290,7 @@ impl Track {
 
     /// Whether the track is too uncertain to be associated directly with a camera that has not been
     /// following it: any line that crosses the other camera's sight line would pass for its target.
-    pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName, motion: &TrackMotion) -> bool {
+    pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName, motion: &MotionSetup) -> bool {
         !self.held
             && !self.is_followed_by(camera, motion)
             && self.position_sd() > MAX_PAIR_SHARE * self.range()
@@ -298,7 +298,7 @@ impl Track {
 
     /// Whether the track is only a direction: one camera alone has lately followed the target, and
     /// the range is unknown.
-    pub(crate) fn is_a_direction(&self, time: Timestamp, motion: &TrackMotion) -> bool {
+    pub(crate) fn is_a_direction(&self, time: Timestamp, motion: &MotionSetup) -> bool {
         let vague =
             |origin| log_range_sd(&self.predicted(time, motion), origin) > VAGUE_LOG_RANGE_SD;
         !self.held && self.follower.is_some_and(vague)
@@ -310,7 +310,7 @@ impl Track {
         &self,
         camera: &CameraName,
         time: Timestamp,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> f64 {
         let visibility = |ties: &Ties| ties.visibility.at(time, motion.holding_s);
         self.ties.get(camera).map_or(Visibility::UNKNOWN, visibility)
@@ -329,7 +329,7 @@ impl Track {
         time: Timestamp,
         seen: bool,
         detection: f64,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) {
         self.note(camera, time);
         if let Some(ties) = self.ties.get_mut(camera) {
@@ -351,7 +351,7 @@ impl Track {
         camera: &CameraName,
         line: &SightLine,
         (time, uncertainty): (Timestamp, &CameraUncertainty),
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Option<Taken> {
         let interval = time.seconds_since(self.updated);
         let innovation = self.innovation(time, line)?;
@@ -404,7 +404,7 @@ impl Track {
     /// Checks whether two cameras still see the target. When that ends, one camera alone has been
     /// seeing it for some time already, and the target may have moved along that camera's sight
     /// line unseen: this motion is added for the time since.
-    fn range_again(&mut self, line: &SightLine, motion: &TrackMotion) {
+    fn range_again(&mut self, line: &SightLine, motion: &MotionSetup) {
         let sees = |ties: &&Ties| ties.sees(self.updated, motion.holding_s);
         let is_ranged = self.ties.values().filter(sees).count() >= 2;
         if std::mem::replace(&mut self.ranged, is_ranged) && !is_ranged {

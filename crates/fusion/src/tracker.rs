@@ -11,7 +11,7 @@ use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 
 use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, ScaleSample};
 use crate::cueing::CueTarget;
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::reacquisition::{Reacquisition, ReacquisitionContext};
 use crate::track::{Track, TrackId, TrackStatus};
 
@@ -42,7 +42,7 @@ impl TrackChange {
 #[derive(Debug)]
 pub(crate) struct Tracker {
     config: Tracking,
-    motion: TrackMotion,
+    motion: MotionSetup,
     gate: Gate,
     /// Beyond this range no camera is expected to see a target, m.
     max_range_m: f64,
@@ -82,7 +82,7 @@ pub(crate) struct TrackerStep {
 }
 
 impl Tracker {
-    pub(crate) fn new(config: Tracking, max_range_m: f64, motion: TrackMotion) -> Self {
+    pub(crate) fn new(config: Tracking, max_range_m: f64, motion: MotionSetup) -> Self {
         let gate = Gate::with_probability(config.gate_probability);
         Self {
             config,
@@ -193,7 +193,7 @@ impl Tracker {
     }
 
     /// How targets move.
-    pub(crate) fn motion(&self) -> &TrackMotion {
+    pub(crate) fn motion(&self) -> &MotionSetup {
         &self.motion
     }
 

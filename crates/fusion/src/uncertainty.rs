@@ -80,14 +80,14 @@ impl SharedErrors {
 /// The part of a bearing's noise that the next bearing of the same target shares: a tracker that
 /// sits beside the target's middle does so for a while.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct SharedNoise {
+pub(crate) struct CorrelatedNoise {
     /// Standard deviation per tangent, rad.
     pub(crate) sd_rad: f64,
     /// Correlation time, s: e^-1 of the noise is left after it.
     pub(crate) time_s: f64,
 }
 
-impl SharedNoise {
+impl CorrelatedNoise {
     /// None: the errors of successive bearings are independent.
     pub(crate) const NONE: Self = Self { sd_rad: 0.0, time_s: 1.0 };
 
@@ -167,7 +167,7 @@ pub(crate) struct CameraUncertainty {
     /// Random walk of the clock beside its offset and its drift, s^2/s.
     pub(crate) clock_walk: f64,
     /// The part of its bearings' noise that lasts.
-    pub(crate) lasting: SharedNoise,
+    pub(crate) lasting: CorrelatedNoise,
     /// Rotation from camera to world axes: the shared errors keep to the camera's axes.
     pub(crate) axes: Rotation3<f64>,
 }
@@ -183,7 +183,7 @@ impl CameraUncertainty {
             clock_is_noise: false,
             clock_source: ClockSource::Unspecified,
             clock_walk: 0.0,
-            lasting: SharedNoise::NONE,
+            lasting: CorrelatedNoise::NONE,
             axes: Rotation3::identity(),
         }
     }
@@ -286,7 +286,7 @@ mod tests {
             pose_scale: 1.0,
             clock_source: ClockSource::Ntp,
             clock_walk: 0.0,
-            lasting: SharedNoise::NONE,
+            lasting: CorrelatedNoise::NONE,
             axes: Rotation3::identity(),
         };
         // 10 m/s along the first tangent: 0.2 rad/s.

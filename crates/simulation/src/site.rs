@@ -157,8 +157,12 @@ impl Site {
 
     fn check(&self) -> Result<(), SceneError> {
         let in_range = |what: &str, value: f64, low: f64, high: f64, must| {
-            let wrong = || SceneError::Number { what: what.to_owned(), value, must };
-            (low..=high).contains(&value).then_some(()).ok_or_else(wrong)
+            let is_in = (low..=high).contains(&value);
+            if is_in {
+                Ok(())
+            } else {
+                Err(SceneError::Number { what: what.to_owned(), value, must })
+            }
         };
         in_range("duration_s", self.duration_s, 1e-3, 1e5, "from 0.001 to 100000 s")?;
         for side in self.area_m {

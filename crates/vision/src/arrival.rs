@@ -43,7 +43,7 @@ const LEAST_PIXELS: f64 = 4.0;
 
 /// The reference's place now, compared with that in a picture of the scene without the target.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct SceneMatch {
+pub(crate) struct ArrivalEvidence {
     /// Contrast of the reference in its place now, and in the picture, as multiples of its own.
     now: f64,
     before: f64,
@@ -58,7 +58,7 @@ pub(crate) struct SceneMatch {
 
 /// Memory for the comparison.
 #[derive(Debug, Default)]
-pub(crate) struct PlaceComparison {
+pub(crate) struct ComparisonBuffers {
     now: Plane,
     before: Plane,
 }
@@ -73,7 +73,7 @@ pub(crate) struct PlacedReference<'a> {
     pub(crate) noise: f64,
 }
 
-impl SceneMatch {
+impl ArrivalEvidence {
     /// Log-likelihood ratio that the target has come there, against that what is there now was
     /// there before; `usual` is the contrast that the target has otherwise.
     ///
@@ -102,7 +102,7 @@ impl SceneMatch {
     }
 }
 
-impl PlaceComparison {
+impl ComparisonBuffers {
     /// Samples the image at the reference's place, for the comparisons to come.
     pub(crate) fn take(
         &mut self,
@@ -126,7 +126,7 @@ impl PlaceComparison {
         seen: Option<ImagePoint>,
         placed: PlacedReference<'_>,
         resampler: &mut Resampler,
-    ) -> Option<SceneMatch> {
+    ) -> Option<ArrivalEvidence> {
         let PlacedReference { reference, energy, noise, .. } = placed;
         if !picture.holds(then) {
             return None;
@@ -210,7 +210,7 @@ impl PixelSums {
         (now - 2.0 * lighter * both + lighter * lighter * before).max(0.0)
     }
 
-    fn arrival(self, whole: f64, noise: f64) -> Option<SceneMatch> {
+    fn arrival(self, whole: f64, noise: f64) -> Option<ArrivalEvidence> {
         let n = self.pixels;
         if n < LEAST_PIXELS {
             return None;
@@ -226,7 +226,7 @@ impl PixelSums {
         let slope = (self.slope_squared / n - 4.0 * noise).max(0.0);
         let unchanged =
             (2.0 * noise + slope * REGISTERED_PX.powi(2)).max(f64::from(f32::MIN_POSITIVE));
-        Some(SceneMatch {
+        Some(ArrivalEvidence {
             now: contrast(self.reference_now, self.now),
             before: contrast(self.reference_before, self.before),
             variance: noise / energy,

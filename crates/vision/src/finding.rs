@@ -7,7 +7,7 @@ use crossfix_message::Timestamp;
 use crate::config::Algorithm;
 use crate::detector::{Detector, Found, KnownTarget};
 use crate::figure::meant;
-use crate::frame::{NewImage, TargetStep};
+use crate::frame::{FrameInput, TargetStep};
 use crate::tracker::{Followed, Follower, Origin, box_of, describe};
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
@@ -218,7 +218,7 @@ impl ImageTracker {
         time: Timestamp,
         interval: f64,
     ) -> bool {
-        let frame = NewImage {
+        let frame = FrameInput {
             image,
             interval,
             snapshot: None,

@@ -7,7 +7,7 @@ use nalgebra::Matrix2;
 use crate::appearance::Drift;
 use crate::frame::Measurement;
 use crate::scratch::Scratch;
-use crate::state::BeliefState;
+use crate::state::TargetBelief;
 use crate::{ImagePoint, TrackerConfig};
 
 /// Floor of a measurement's standard deviation, px: the bias of the fit over the phases of a pixel,
@@ -44,7 +44,7 @@ impl TargetFit {
     }
 }
 
-impl BeliefState {
+impl TargetBelief {
     /// Fits the reference at a placement of the gate, given by column and row.
     pub(crate) fn fit_at(
         &mut self,

@@ -11,7 +11,7 @@ pub(crate) const FRAME_INTERVAL: f64 = 1.0 / 30.0;
 
 /// The next image, and what goes with it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct NewImage<'a> {
+pub(crate) struct FrameInput<'a> {
     pub(crate) image: &'a Plane,
     /// Time since the image before, s.
     pub(crate) interval: f64,
@@ -28,7 +28,7 @@ pub(crate) struct NewImage<'a> {
     pub(crate) config: &'a TrackerConfig,
 }
 
-impl NewImage<'_> {
+impl FrameInput<'_> {
     /// Columns and rows of the image.
     pub(crate) fn sides(&self) -> [usize; 2] {
         [self.image.width(), self.image.height()]

@@ -7,12 +7,12 @@ use crossfix_filter::Gate;
 use crate::TrackerConfig;
 use crate::config::GateRule;
 use crate::crop::crop;
-use crate::frame::NewImage;
+use crate::frame::FrameInput;
 use crate::likelihood::log_ratios;
 use crate::motion::ImageMotion;
 use crate::posterior::{PlacePrior, Posterior};
 use crate::scratch::Scratch;
-use crate::state::BeliefState;
+use crate::state::TargetBelief;
 
 /// Correlation time of being hidden, s: about how long a target stays hidden once it is. A blur is
 /// shorter, a cloud longer. When it was chosen, of ten seeds' sequences 3.8 % of the frames were
@@ -35,7 +35,7 @@ pub(crate) struct Region {
 }
 
 impl Region {
-    pub(crate) fn about(state: &BeliefState, half: [usize; 2]) -> Self {
+    pub(crate) fn about(state: &TargetBelief, half: [usize; 2]) -> Self {
         let expected = state.motion.found();
         let reference = state.appearance.working.image();
         let reference = [reference.width(), reference.height()];
@@ -45,7 +45,7 @@ impl Region {
     }
 }
 
-impl BeliefState {
+impl TargetBelief {
     /// Half sides of the gate (Herasymenko 2021, section 1; Lytvynets 2020, eq. 5.12): how far from
     /// the prediction the reference is placed.
     pub(crate) fn half_gate(&self, image: &Plane, config: &TrackerConfig) -> [usize; 2] {
@@ -102,7 +102,7 @@ impl BeliefState {
         motion: &ImageMotion,
         hidden: f64,
         region: Region,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
     ) -> PlacePrior {
         let config = frame.config;
         let expected = motion.found();
@@ -124,11 +124,11 @@ impl BeliefState {
     /// and the log likelihood ratios in `scratch.ratios`.
     pub(crate) fn posterior(
         &self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) -> Posterior {
-        let NewImage { image, config, .. } = frame;
+        let FrameInput { image, config, .. } = frame;
         let Region { origin, corner, sides, .. } = region;
         crop(image, corner, sides, &mut scratch.gate);
         scratch.correlator.statistics(

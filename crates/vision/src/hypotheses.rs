@@ -7,12 +7,12 @@
 use crossfix_filter::AxisMeasurement;
 
 use crate::ImagePoint;
-use crate::frame::NewImage;
+use crate::frame::FrameInput;
 use crate::gate::Region;
 use crate::motion::ImageMotion;
 use crate::posterior::Posterior;
 use crate::scratch::Scratch;
-use crate::state::BeliefState;
+use crate::state::TargetBelief;
 
 /// Certainty of the best place below which the other places are kept too.
 pub(crate) const DOUBT: f64 = 0.9;
@@ -48,7 +48,7 @@ pub(crate) struct PlaceHypothesis {
 
 impl PlaceHypothesis {
     /// The hypothesis of a target whose place is not in doubt yet.
-    fn of(state: &BeliefState) -> Self {
+    fn of(state: &TargetBelief) -> Self {
         Self { weight: 1.0, motion: state.motion.clone(), hidden: state.hidden, peak: None }
     }
 
@@ -106,7 +106,7 @@ impl PlaceHypotheses {
         self.all.is_empty()
     }
 
-    pub(crate) fn predict(&mut self, frame: NewImage<'_>) {
+    pub(crate) fn predict(&mut self, frame: FrameInput<'_>) {
         for hypothesis in &mut self.all {
             hypothesis.motion.predict(frame.interval, frame.sides());
         }
@@ -114,7 +114,7 @@ impl PlaceHypotheses {
 
     /// Starts with the target's present state as the only hypothesis, unless there are some
     /// already.
-    pub(crate) fn begin(&mut self, state: &BeliefState) {
+    pub(crate) fn begin(&mut self, state: &TargetBelief) {
         if self.all.is_empty() {
             self.all.push(PlaceHypothesis::of(state));
         }
@@ -170,8 +170,8 @@ impl PlaceHypotheses {
     /// `scratch.ratios`.
     pub(crate) fn advance(
         &mut self,
-        state: &BeliefState,
-        frame: NewImage<'_>,
+        state: &TargetBelief,
+        frame: FrameInput<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) {
@@ -182,8 +182,8 @@ impl PlaceHypotheses {
     /// weight leads to that one place.
     pub(crate) fn one_place(
         &self,
-        state: &BeliefState,
-        frame: NewImage<'_>,
+        state: &TargetBelief,
+        frame: FrameInput<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) -> Option<(ImageMotion, Posterior)> {
@@ -214,8 +214,8 @@ impl PlaceHypotheses {
     /// seen, and one per peak of its posterior.
     fn branches(
         &self,
-        state: &BeliefState,
-        frame: NewImage<'_>,
+        state: &TargetBelief,
+        frame: FrameInput<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) -> Vec<PlaceHypothesis> {

@@ -4,11 +4,11 @@
 use crate::ImagePoint;
 use crate::arrival::PlacedReference;
 use crate::fit::TargetFit;
-use crate::frame::{FRAME_INTERVAL, NewImage};
+use crate::frame::{FRAME_INTERVAL, FrameInput};
 use crate::motion::ImageMotion;
 use crate::scene::{SceneMemory, ScenePicture};
 use crate::scratch::Scratch;
-use crate::state::BeliefState;
+use crate::state::TargetBelief;
 
 /// How long a target that was found again must have been seen before it is believed, s: until then
 /// a mistake costs what is known of where it went, and nothing is learnt of it.
@@ -89,7 +89,7 @@ impl Identity {
     }
 
     /// Notes its place in the scene in the image before, if it was seen for sure.
-    pub(crate) fn note_last_place(&mut self, state: &BeliefState, frame: NewImage<'_>) {
+    pub(crate) fn note_last_place(&mut self, state: &TargetBelief, frame: FrameInput<'_>) {
         if state.unseen_s > 0.0 || self.probation.is_some() {
             return;
         }
@@ -99,7 +99,7 @@ impl Identity {
     }
 
     /// Notes its place when a picture of the scene was taken, if it was seen.
-    pub(crate) fn note_picture(&mut self, state: &BeliefState, number: u64) {
+    pub(crate) fn note_picture(&mut self, state: &TargetBelief, number: u64) {
         // While it is in doubt, its place is not known.
         if state.unseen_s > 0.0 {
             return;
@@ -123,8 +123,8 @@ impl Identity {
     /// now. A target that hovered, and is where it was, may be in all of the pictures.
     pub(crate) fn arrival_log_ratio(
         &self,
-        state: &BeliefState,
-        frame: NewImage<'_>,
+        state: &TargetBelief,
+        frame: FrameInput<'_>,
         place: ImagePoint,
         scratch: &mut Scratch,
     ) -> f64 {
@@ -142,9 +142,10 @@ impl Identity {
         let mut against = |picture: &ScenePicture, then: ImagePoint| {
             let seen = self.place_in(picture);
             let has_moved_on = speed * picture.age_s() > longest;
-            let tells = seen.is_some() || (self.was_lost(state, picture) && has_moved_on);
-            let resampler = &mut buffers.resampler;
-            tells.then(|| comparison.with(picture, then, seen, placed, resampler)).flatten()
+            if seen.is_none() && !(self.was_lost(state, picture) && has_moved_on) {
+                return None;
+            }
+            comparison.with(picture, then, seen, placed, &mut buffers.resampler)
         };
         let pictures = || frame.scene.pictures();
         let scene = pictures().find_map(|picture| against(picture, picture.then(place)));
@@ -162,13 +163,13 @@ impl Identity {
     }
 
     /// Whether the target may have been lost when a picture of the scene was taken.
-    fn was_lost(&self, state: &BeliefState, picture: &ScenePicture) -> bool {
+    fn was_lost(&self, state: &TargetBelief, picture: &ScenePicture) -> bool {
         let lost_since = self.probation.as_ref().map(|probation| probation.picture);
         state.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest)
     }
 
     /// Least speed with which a lost target can have come to a place by now, px/s.
-    fn least_speed(&self, state: &BeliefState, frame: NewImage<'_>, place: ImagePoint) -> f64 {
+    fn least_speed(&self, state: &TargetBelief, frame: FrameInput<'_>, place: ImagePoint) -> f64 {
         let Some([x, y]) = self.last_in_scene else { return 0.0 };
         let turned = frame.scene.turned();
         let lost_s = self.probation.as_ref().map_or(state.unseen_s, |probation| probation.unseen_s);
@@ -180,8 +181,8 @@ impl Identity {
     /// whether that stands out as the target does.
     pub(crate) fn doubt(
         &mut self,
-        state: &BeliefState,
-        frame: NewImage<'_>,
+        state: &TargetBelief,
+        frame: FrameInput<'_>,
         fit: TargetFit,
         scratch: &mut Scratch,
     ) -> f64 {
@@ -200,7 +201,7 @@ impl Identity {
     }
 
     /// Begins a probation: a search has found something.
-    pub(crate) fn begin_probation(&mut self, state: &BeliefState, scene: &SceneMemory) {
+    pub(crate) fn begin_probation(&mut self, state: &TargetBelief, scene: &SceneMemory) {
         self.probation = Some(Probation {
             motion: state.motion.clone(),
             unseen_s: state.unseen_s,
@@ -213,7 +214,7 @@ impl Identity {
     }
 
     /// Predicts what was known before it was found again to the time of the next image.
-    pub(crate) fn predict_probation(&mut self, frame: NewImage<'_>) {
+    pub(crate) fn predict_probation(&mut self, frame: FrameInput<'_>) {
         if let Some(probation) = &mut self.probation {
             probation.motion.predict(frame.interval, frame.sides());
             probation.unseen_s += frame.interval;
@@ -222,7 +223,7 @@ impl Identity {
 
     /// Ends a probation: what was found again is lost again, so it was something else, and what was
     /// known before is restored. False if there was no probation.
-    pub(crate) fn fail_probation(&mut self, state: &mut BeliefState) -> bool {
+    pub(crate) fn fail_probation(&mut self, state: &mut TargetBelief) -> bool {
         let Some(before) = self.probation.take() else { return false };
         (state.motion, state.unseen_s, state.last_seen) =
             (before.motion, before.unseen_s, before.last_seen);
@@ -244,7 +245,7 @@ impl Identity {
 
 /// Log-likelihood ratio of a contrast being the target's, whose usual one is known, against it
 /// being the largest of so many placements' in noise.
-fn above_noise_log_ratio(state: &BeliefState, contrast: f64, placements: f64) -> f64 {
+fn above_noise_log_ratio(state: &TargetBelief, contrast: f64, placements: f64) -> f64 {
     let deviation =
         f64::from(state.noise / state.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();
     let clear = f64::from(state.appearance.clear_share());

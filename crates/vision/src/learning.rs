@@ -2,9 +2,9 @@
 
 use crate::ImagePoint;
 use crate::fit::TargetFit;
-use crate::frame::{FRAME_INTERVAL, NewImage};
+use crate::frame::{FRAME_INTERVAL, FrameInput};
 use crate::scratch::Scratch;
-use crate::state::{BeliefState, SEEN};
+use crate::state::{SEEN, TargetBelief};
 
 /// Averaging time of the usual contrast, s: longer than a cloud takes it away.
 const USUAL_S: f64 = 3.0;
@@ -28,18 +28,18 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
     ((value - low) / (high - low)).clamp(0.0, 1.0)
 }
 
-impl BeliefState {
+impl TargetBelief {
     /// Learns contrast, size, direction and appearance from an image, the more the surer the target
     /// was seen.
     pub(crate) fn learn(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         place: ImagePoint,
         fit: TargetFit,
         certainty: f64,
         scratch: &mut Scratch,
     ) {
-        let NewImage { image, interval, .. } = frame;
+        let FrameInput { image, interval, .. } = frame;
         if certainty < LEAST_CERTAINTY[0] {
             return;
         }

@@ -129,10 +129,10 @@ impl PaperTarget {
             if config.paper.sub_pixel { peak.refined(&scratch.ratios) } else { peak.whole() };
         let reference = self.reference.image();
         let (width, height) = (reference.width(), reference.height());
-        let (across, down) = (scratch.gate.width(), scratch.gate.height());
+        let (gate_width, gate_height) = (scratch.gate.width(), scratch.gate.height());
         let place = ImagePoint {
-            x: start[0] + reference_middle(refined.x, width, across, extent) + self.middle[0],
-            y: start[1] + reference_middle(refined.y, height, down, extent) + self.middle[1],
+            x: start[0] + reference_middle(refined.x, width, gate_width, extent) + self.middle[0],
+            y: start[1] + reference_middle(refined.y, height, gate_height, extent) + self.middle[1],
         };
         let nis = if let Some([x, y]) = &mut self.axes {
             let innovations = [

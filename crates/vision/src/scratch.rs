@@ -3,7 +3,7 @@
 use crossfix_correlation::{Correlator, Plane, Statistics};
 
 use crate::appearance::AppearanceScratch;
-use crate::arrival::PlaceComparison;
+use crate::arrival::ComparisonBuffers;
 use crate::noise::NoiseMeter;
 use crate::posterior::PosteriorMap;
 
@@ -18,7 +18,7 @@ pub(crate) struct Scratch {
     pub(crate) ratios: Plane,
     pub(crate) search: SearchScratch,
     pub(crate) map: PosteriorMap,
-    pub(crate) comparison: PlaceComparison,
+    pub(crate) comparison: ComparisonBuffers,
 }
 
 /// Buffers of a search.

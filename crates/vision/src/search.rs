@@ -7,13 +7,13 @@ use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
 use crate::TrackerConfig;
 use crate::crop::{crop, replace_invalid};
 use crate::fit::TargetFit;
-use crate::frame::NewImage;
+use crate::frame::FrameInput;
 use crate::identity::Identity;
 use crate::likelihood::log_ratios;
 use crate::noise::{OF_MEDIAN, median};
 use crate::scratch::{Scratch, SearchScratch};
 use crate::search_memory::{Background, SearchMemory};
-use crate::state::BeliefState;
+use crate::state::TargetBelief;
 
 /// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few
 /// milliseconds then; with 8 it takes three times as long and finds no more, with 3 it finds what
@@ -65,7 +65,7 @@ fn coarsened(from: &Plane, side: usize, to: &mut Plane) {
 
 /// The target's reference on the coarse picture.
 fn coarse_reference(
-    state: &BeliefState,
+    state: &TargetBelief,
     coarseness: usize,
     resampler: &mut Resampler,
 ) -> Reference {
@@ -94,7 +94,7 @@ impl Coarse {
     /// picture, into `scratch.ratios`.
     fn ratios(
         &self,
-        state: &BeliefState,
+        state: &TargetBelief,
         noise: f32,
         picture: &Plane,
         [columns, rows]: &[Range<usize>; 2],
@@ -116,14 +116,14 @@ impl Coarse {
     }
 
     /// How much the part that has been correlated last looks like the reference.
-    fn likeness(&self, scratch: &mut Scratch) -> ReferenceLikeness {
+    fn likeness(&self, scratch: &mut Scratch) -> PictureLikeness {
         let covariances = scratch.statistics.covariance.samples();
         let SearchScratch { contrasts, .. } = &mut scratch.search;
         contrasts.clear();
         contrasts.extend(covariances.iter().map(|covariance| covariance.abs()));
         let deviation =
             OF_MEDIAN * median(contrasts) / self.reference.variance().max(f32::MIN_POSITIVE);
-        ReferenceLikeness {
+        PictureLikeness {
             deviation: f64::from(deviation).max(LEAST_LIKENESS),
             places: contrasts.len().max(1) as f64,
         }
@@ -133,13 +133,13 @@ impl Coarse {
 /// How much the picture that is searched looks like a target: the contrasts with which the target's
 /// reference is found at its places.
 #[derive(Clone, Copy, Debug)]
-struct ReferenceLikeness {
+struct PictureLikeness {
     /// Standard deviation of the contrasts about zero.
     deviation: f64,
     places: f64,
 }
 
-impl ReferenceLikeness {
+impl PictureLikeness {
     /// Log-likelihood ratio of a contrast being the target's, whose usual one is known, against it
     /// being the largest of the scene's places.
     fn log_ratio(self, contrast: f64, usual: f64, contrast_sd: f64) -> f64 {
@@ -162,7 +162,7 @@ struct Searched<'a> {
 
 /// A lost target, with what is kept for its search.
 pub(crate) struct Sought<'a> {
-    pub(crate) state: &'a mut BeliefState,
+    pub(crate) state: &'a mut TargetBelief,
     pub(crate) identity: &'a Identity,
     pub(crate) memory: &'a mut SearchMemory,
 }
@@ -171,7 +171,7 @@ impl Sought<'_> {
     /// Searches for it: by turns in what has changed, where no cloud is, and in the image, where it
     /// may hover; and by turns with its last appearance and its first, which it keeps if it is
     /// found by that.
-    pub(crate) fn find(&mut self, frame: NewImage<'_>, scratch: &mut Scratch) -> SearchResult {
+    pub(crate) fn find(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> SearchResult {
         let mut change = std::mem::take(&mut scratch.search.change);
         let searches = self.memory.searches;
         let is_change = searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
@@ -195,7 +195,7 @@ impl Sought<'_> {
 
     fn find_in(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         searched: Searched<'_>,
         scratch: &mut Scratch,
     ) -> SearchResult {
@@ -255,7 +255,7 @@ pub(crate) struct BestPlacement {
     pub(crate) sides: [usize; 2],
 }
 
-impl BeliefState {
+impl TargetBelief {
     /// The best placement of the target's reference within `reach` of a place, px, at full
     /// resolution. Leaves the part of the image that the placements cover in `scratch.gate`.
     pub(crate) fn best_near(
@@ -309,8 +309,8 @@ impl BeliefState {
 /// Notes the log likelihood ratios of the scene itself, from the snapshot, once per loss.
 fn remember_background(
     memory: &mut SearchMemory,
-    state: &BeliefState,
-    frame: NewImage<'_>,
+    state: &TargetBelief,
+    frame: FrameInput<'_>,
     coarse: &Coarse,
     scratch: &mut Scratch,
 ) {
@@ -355,7 +355,7 @@ struct SearchArea {
 
 impl SearchArea {
     fn new(
-        state: &BeliefState,
+        state: &TargetBelief,
         image: &Plane,
         coarse: &Coarse,
         is_change: bool,
@@ -380,7 +380,7 @@ impl SearchArea {
 
     fn best_place(
         &self,
-        state: &BeliefState,
+        state: &TargetBelief,
         memory: &SearchMemory,
         scratch: &mut Scratch,
         config: &TrackerConfig,
@@ -434,7 +434,7 @@ impl SearchArea {
         &self,
         column: usize,
         row: usize,
-        state: &BeliefState,
+        state: &TargetBelief,
         memory: &SearchMemory,
     ) -> f32 {
         if self.is_change {

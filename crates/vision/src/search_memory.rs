@@ -9,7 +9,7 @@ use crossfix_correlation::Plane;
 
 use crate::TrackerConfig;
 use crate::appearance::{Appearance, AppearanceScratch};
-use crate::state::BeliefState;
+use crate::state::TargetBelief;
 
 /// Correlation below which two appearances are different: on the real and drawn cases those of
 /// targets that have not changed correlate by 0.94 or more, and 0.65 to 0.78 where the last one
@@ -68,7 +68,7 @@ impl SearchMemory {
     /// a moment ago. Returns whether it has.
     pub(crate) fn take_first(
         &mut self,
-        state: &mut BeliefState,
+        state: &mut TargetBelief,
         config: &TrackerConfig,
         buffers: &mut AppearanceScratch,
     ) -> bool {
@@ -96,13 +96,13 @@ impl SearchMemory {
     }
 
     /// Gives the target its last appearance back, if the first is in use.
-    pub(crate) fn take_last(&mut self, state: &mut BeliefState) {
+    pub(crate) fn take_last(&mut self, state: &mut TargetBelief) {
         if self.other.as_ref().is_some_and(|other| other.is_last) {
             self.exchange(state);
         }
     }
 
-    fn exchange(&mut self, state: &mut BeliefState) {
+    fn exchange(&mut self, state: &mut TargetBelief) {
         let Some(other) = &mut self.other else { return };
         std::mem::swap(&mut state.appearance, &mut other.appearance);
         std::mem::swap(&mut state.contrast, &mut other.contrast);

@@ -3,7 +3,7 @@
 use crate::PixelBox;
 use crate::fit::TargetFit;
 use crate::followed_target::Target;
-use crate::frame::{NewImage, TargetStep};
+use crate::frame::{FrameInput, TargetStep};
 use crate::scratch::Scratch;
 use crate::search::LEAST_RATIO;
 
@@ -16,7 +16,7 @@ const OFF_SIDES: f64 = 0.5;
 
 /// A find of the detector that may be a lost target.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct LostSighting {
+pub(crate) struct SightingOfLost {
     fit: TargetFit,
     /// Log likelihood ratio of the target being there, against background.
     pub(crate) log_ratio: f32,
@@ -28,10 +28,10 @@ impl Target {
     /// that is lost, can have gone there, is about as large, and looked like it last or at first.
     pub(crate) fn sighting(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         found: PixelBox,
         scratch: &mut Scratch,
-    ) -> Option<LostSighting> {
+    ) -> Option<SightingOfLost> {
         if !self.state.is_searching() || !self.may_be(frame, found) {
             return None;
         }
@@ -41,7 +41,7 @@ impl Target {
         }
         let first = self.seen_as_it_looks(frame, found, scratch);
         self.search_memory.take_last(&mut self.state);
-        let first = first.map(|first| LostSighting { as_at_first: true, ..first });
+        let first = first.map(|first| SightingOfLost { as_at_first: true, ..first });
         [last, first]
             .into_iter()
             .flatten()
@@ -49,7 +49,7 @@ impl Target {
     }
 
     /// Whether the target may be where something has been found, and as large.
-    fn may_be(&self, frame: NewImage<'_>, found: PixelBox) -> bool {
+    fn may_be(&self, frame: FrameInput<'_>, found: PixelBox) -> bool {
         let half = self.state.search_half_sides(frame.image, frame.config);
         let (at, predicted) = (found.centre(), self.state.position());
         let is_near =
@@ -63,10 +63,10 @@ impl Target {
     /// target.
     fn seen_as_it_looks(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         found: PixelBox,
         scratch: &mut Scratch,
-    ) -> Option<LostSighting> {
+    ) -> Option<SightingOfLost> {
         let [width, height] = self.state.appearance.sides();
         let reach = OFF_SIDES * found.width.max(found.height).max(width).max(height);
         let at = found.centre();
@@ -81,17 +81,17 @@ impl Target {
         let fit = self.state.fit_at(peak.column, peak.row, peak.origin, scratch, frame.config);
         let has_come = peak.log_ratio > LEAST_RATIO
             && self.identity.arrival_log_ratio(&self.state, frame, fit.place, scratch) >= 0.0;
-        has_come.then_some(LostSighting { fit, log_ratio: peak.log_ratio, as_at_first: false })
+        has_come.then_some(SightingOfLost { fit, log_ratio: peak.log_ratio, as_at_first: false })
     }
 
     /// Goes on, on probation, where the detector has found the target.
     pub(crate) fn go_on_at(
         &mut self,
-        frame: NewImage<'_>,
-        sighting: LostSighting,
+        frame: FrameInput<'_>,
+        sighting: SightingOfLost,
         scratch: &mut Scratch,
     ) -> TargetStep {
-        let LostSighting { fit, as_at_first, .. } = sighting;
+        let SightingOfLost { fit, as_at_first, .. } = sighting;
         if as_at_first {
             self.search_memory.take_first(&mut self.state, frame.config, &mut scratch.buffers);
         }

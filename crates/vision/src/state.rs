@@ -9,7 +9,7 @@ use crossfix_filter::AxisMeasurement;
 
 use crate::appearance::Appearance;
 use crate::crop::crop;
-use crate::frame::{FRAME_INTERVAL, NewImage};
+use crate::frame::{FRAME_INTERVAL, FrameInput};
 use crate::likelihood::Expectation;
 use crate::motion::ImageMotion;
 use crate::scratch::Scratch;
@@ -28,7 +28,7 @@ const MOST_SHAPE_VARIANCE: [f64; 2] = [0.09, 0.25];
 
 /// State of the belief about one target.
 #[derive(Clone, Debug)]
-pub(crate) struct BeliefState {
+pub(crate) struct TargetBelief {
     pub(crate) appearance: Appearance,
     pub(crate) motion: ImageMotion,
     /// Probability that the target was hidden in the last image.
@@ -52,7 +52,7 @@ pub(crate) struct BeliefState {
     pub(crate) in_snapshot: Option<ImagePoint>,
 }
 
-impl BeliefState {
+impl TargetBelief {
     /// State of a target that somebody shows: the box and a margin become the reference (Lytvynets
     /// 2020, object model).
     pub(crate) fn new(
@@ -112,7 +112,7 @@ impl BeliefState {
     }
 
     /// Predicts to the time of the next image.
-    pub(crate) fn predict(&mut self, frame: NewImage<'_>) {
+    pub(crate) fn predict(&mut self, frame: FrameInput<'_>) {
         self.motion.predict(frame.interval, frame.sides());
         self.unseen_s += frame.interval;
         let frames = frame.interval / FRAME_INTERVAL;

@@ -5,7 +5,7 @@ use nalgebra::Matrix2;
 use crate::config::Algorithm;
 use crate::detector::Detector;
 use crate::followed_target::Target;
-use crate::frame::{Measurement, NewImage, TargetStep};
+use crate::frame::{FrameInput, Measurement, TargetStep};
 use crate::paper::PaperTarget;
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
@@ -103,7 +103,7 @@ impl Follower {
 
     fn step(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         cue: Option<ImagePoint>,
         scratch: &mut Scratch,
     ) -> TargetStep {
@@ -332,7 +332,7 @@ impl ImageTracker {
         }
         let after = self.scene.turned();
         let scene_moved = [0, 1].map(|i| before[i] - after[i]);
-        let frame = NewImage {
+        let frame = FrameInput {
             image,
             interval,
             snapshot,
@@ -350,7 +350,7 @@ impl ImageTracker {
             .min_by_key(|f| f.searched)
             .map(|f| f.id);
         for followed in &mut self.followed {
-            let frame = NewImage { may_search: turn == Some(followed.id), ..frame };
+            let frame = FrameInput { may_search: turn == Some(followed.id), ..frame };
             if frame.may_search {
                 followed.searched = Some(time);
             }

@@ -21,11 +21,11 @@ struct SimilarityTransform {
 }
 
 /// A place of the site as cameras reconstruct it, and as the survey has it.
-type CommonPlace = (Point3<f64>, Point3<f64>);
+type PlacePair = (Point3<f64>, Point3<f64>);
 
 /// What is known in both frames: that of the reconstruction, and that of the survey.
-struct KnownPlaces {
-    places: Vec<CommonPlace>,
+struct Correspondences {
+    places: Vec<PlacePair>,
     rotations: Vec<(Rotation3<f64>, Rotation3<f64>)>,
     /// Why cameras' own landmarks tell no pose.
     untold: Vec<String>,
@@ -41,8 +41,8 @@ pub(super) fn to_survey(
     labels: &[CameraLabels],
     survey: &Survey,
 ) -> Result<(FlightState, f64), Vec<String>> {
-    let KnownPlaces { places, rotations, untold } =
-        KnownPlaces::of(state, labels, survey).without_wrong();
+    let Correspondences { places, rotations, untold } =
+        Correspondences::of(state, labels, survey).without_wrong();
     let scale = size(&places).or_else(|| taped(state, labels, survey)).ok_or(untold)?;
     let (from, to) = if places.is_empty() {
         (state.cameras[0].centre, Point3::origin())
@@ -64,12 +64,12 @@ pub(super) fn to_survey(
     Ok((SimilarityTransform { rotation, scale, from, to }.moved(state), scale))
 }
 
-fn middles(places: &[CommonPlace]) -> CommonPlace {
+fn middles(places: &[PlacePair]) -> PlacePair {
     (middle(places.iter().map(|pair| pair.0)), middle(places.iter().map(|pair| pair.1)))
 }
 
 fn arms(
-    places: &[CommonPlace],
+    places: &[PlacePair],
     from: Point3<f64>,
     to: Point3<f64>,
 ) -> Vec<(Vector3<f64>, Vector3<f64>)> {
@@ -87,7 +87,7 @@ const FAR_TURNED_RAD: f64 = 0.2;
 
 impl SimilarityTransform {
     /// The similarity that three places determine; `None` where they lie on a line.
-    fn of_three(three: &[CommonPlace]) -> Option<Self> {
+    fn of_three(three: &[PlacePair]) -> Option<Self> {
         let (from, to) = middles(three);
         let rotation = turn(&arms(three, from, to))?;
         Some(Self { rotation, scale: size(three)?, from, to })
@@ -97,12 +97,12 @@ impl SimilarityTransform {
         self.to + self.rotation * (place - self.from) * self.scale
     }
 
-    fn misfit(&self, (here, there): &CommonPlace) -> f64 {
+    fn misfit(&self, (here, there): &PlacePair) -> f64 {
         (self.place(*here) - there).norm()
     }
 }
 
-impl KnownPlaces {
+impl Correspondences {
     /// Removes what is not where the rest is (least median of squares: the triple whose similarity
     /// half of all places fit best): one wrong place among four would turn the site over.
     fn without_wrong(mut self) -> Self {
@@ -110,7 +110,7 @@ impl KnownPlaces {
         if self.places.len() <= ENOUGH_PLACES {
             return self;
         }
-        let tried: Vec<CommonPlace> =
+        let tried: Vec<PlacePair> =
             self.places.iter().step_by(self.places.len().div_ceil(TRIED_PLACES)).copied().collect();
         let mut best: Option<(f64, SimilarityTransform)> = None;
         for a in 0..tried.len() {

@@ -4,7 +4,7 @@ use super::align;
 use super::course::Course;
 use super::error::{FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal};
 use super::model::{CameraLabels, CameraUnknowns, FlightLog, frame_time, hours};
-use super::pairs::{self, CameraPair, Sights};
+use super::pairs::{self, RelativePose, Sights};
 use super::spline::TrajectorySpline;
 use super::state::{CameraPriors, FlightState, Priors, RATE_SD};
 use super::would_fit::WouldFit;
@@ -358,7 +358,7 @@ struct BeginWith<'a> {
     cameras: [&'a CameraLabels; 2],
     /// Rotation, centre, and the time by the first's clock less that by the camera's own, s.
     poses: [(Rotation3<f64>, Point3<f64>, f64); 2],
-    /// As [`CameraPair::doubt`].
+    /// As [`RelativePose::doubt`].
     doubt: f64,
     /// Whether the poses are those of an earlier calibration.
     is_known: bool,
@@ -369,7 +369,7 @@ impl<'a> BeginWith<'a> {
         pairs::find(sights[0], sights[1]).iter().map(|pair| Self::of_pair(cameras, pair)).collect()
     }
 
-    fn of_pair(cameras: [&'a CameraLabels; 2], pair: &CameraPair) -> Self {
+    fn of_pair(cameras: [&'a CameraLabels; 2], pair: &RelativePose) -> Self {
         Self {
             cameras,
             poses: [

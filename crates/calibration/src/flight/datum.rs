@@ -21,8 +21,8 @@ pub(super) struct Followers {
     by_datum: DMatrix<f64>,
 }
 
-/// The datum as estimated from the cameras, and how well it is known.
-pub(super) struct EstimatedDatum {
+/// How the datum follows from the cameras' differences, and how well that is known.
+pub(super) struct DatumEstimator {
     /// The datum's components (rows) from the cameras' differences (columns).
     gain: DMatrix<f64>,
     /// Information on the datum, ...
@@ -70,7 +70,7 @@ impl Followers {
     /// uncorrelated: `D = (H' N H)^-1` where the cameras follow the datum by H and N is the
     /// information. Better known cameras count for more in it than poorly known ones. `None`: there
     /// is no information.
-    pub(super) fn shown(&self, information: &DMatrix<f64>) -> Option<EstimatedDatum> {
+    pub(super) fn estimator(&self, information: &DMatrix<f64>) -> Option<DatumEstimator> {
         let weighed = information * &self.by_datum;
         let on_datum = self.by_datum.tr_mul(&weighed);
         let covariance = inverse_of_what_is_shown(&on_datum)?;
@@ -78,13 +78,13 @@ impl Followers {
         // covariance.
         let gain = &covariance * weighed.transpose();
         let of_cameras = &self.by_datum * &covariance * self.by_datum.transpose();
-        Some(EstimatedDatum { gain, information: on_datum, of_cameras })
+        Some(DatumEstimator { gain, information: on_datum, of_cameras })
     }
 
     /// The cameras' differences with the datum's part removed.
     pub(super) fn without_datum(
         &self,
-        shown: &EstimatedDatum,
+        shown: &DatumEstimator,
         differences: &DVector<f64>,
     ) -> DVector<f64> {
         differences - &self.by_datum * (&shown.gain * differences)
@@ -93,7 +93,7 @@ impl Followers {
     /// The site's datum, where `prior_information` of the information on it comes from no measurement.
     pub(super) fn datum(
         &self,
-        shown: &EstimatedDatum,
+        shown: &DatumEstimator,
         prior_information: &DMatrix<f64>,
         is_timeless: bool,
     ) -> Datum {
@@ -116,7 +116,7 @@ impl Followers {
     }
 }
 
-impl EstimatedDatum {
+impl DatumEstimator {
     /// Matrix that gives the datum's components from the cameras' differences.
     pub(super) fn into_gain(self) -> DMatrix<f64> {
         self.gain

@@ -41,7 +41,7 @@ impl Gauge {
             (0..3).for_each(|k| weight[(own + k, own + k)] = RANGE_M * RANGE_M);
             (3..CLOCK + 2).for_each(|k| weight[(own + k, own + k)] = 1.0);
         }
-        Some(Self { from: from.clone(), gain: followers.shown(&weight)?.into_gain() })
+        Some(Self { from: from.clone(), gain: followers.estimator(&weight)?.into_gain() })
     }
 
     pub(super) fn rows(&self, state: &FlightState, sink: &mut impl Sink) {

@@ -42,7 +42,7 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &FlightState) -> Option
     let saw_both =
         |index: usize| halves.iter().all(|cameras| cameras[index].labels.len() >= LEAST_LABELS);
     let shown: Vec<usize> = (0..state.cameras.len()).filter(|&index| saw_both(index)).collect();
-    let apart = HalfDifference::of(state, [&first, &second], &shown)?;
+    let apart = DifferenceOfHalves::of(state, [&first, &second], &shown)?;
     let mut ratios = vec![None; state.cameras.len()];
     for (start, &index) in apart.starts.iter().zip(&shown) {
         let noise = &priors.cameras[index].noise;
@@ -78,14 +78,14 @@ fn half(
 
 /// Difference between the halves of the cameras' own unknowns, without the datum, and the
 /// covariance that this difference should have.
-struct HalfDifference {
+struct DifferenceOfHalves {
     difference: DVector<f64>,
     covariance: DMatrix<f64>,
     /// Index of each camera's first unknown.
     starts: Vec<usize>,
 }
 
-impl HalfDifference {
+impl DifferenceOfHalves {
     fn of(state: &FlightState, halves: [&AdjustedFlight; 2], shown: &[usize]) -> Option<Self> {
         let (first, all) = (state.order().chain(), state.starts());
         let own = |index: &usize| all[*index] - first..all[*index + 1] - first;
@@ -106,7 +106,7 @@ impl HalfDifference {
         let difference = DVector::from_vec(difference);
         // The log's bias differs between the halves: what all cameras have in common is the log's.
         let followers = Followers::of(state).rows(&rows);
-        let datum = followers.shown(&covariance.clone().cholesky()?.inverse())?;
+        let datum = followers.estimator(&covariance.clone().cholesky()?.inverse())?;
         Some(Self {
             difference: followers.without_datum(&datum, &difference),
             covariance: covariance - datum.of_cameras(),

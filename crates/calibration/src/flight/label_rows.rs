@@ -26,7 +26,7 @@ impl FlightState {
         priors: &CameraPriors,
         sink: &mut S,
     ) {
-        let mut before: Option<(f64, LabelRow)> = None;
+        let mut before: Option<(f64, LabelTerms)> = None;
         for label in &camera.labels {
             let placed = self.placed(index, label);
             let Some(placed) = placed else {
@@ -67,11 +67,11 @@ impl FlightState {
         Some(rows.map(|(terms, _)| terms))
     }
 
-    fn placed(&self, index: usize, label: &Label) -> Option<LabelRow> {
+    fn placed(&self, index: usize, label: &Label) -> Option<LabelTerms> {
         let (first, weights, seen) = self.see(index, label)?;
         let clock = &self.cameras[index].clock;
         let wander = clock.wander.weights(clock.straight_s(label.time_s));
-        let placed = LabelRow { first, weights, seen, wander };
+        let placed = LabelTerms { first, weights, seen, wander };
         placed.touched().fit().then_some(placed)
     }
 
@@ -80,8 +80,8 @@ impl FlightState {
         &self,
         index: usize,
         start: usize,
-        now: &LabelRow,
-        before: Option<&LabelRow>,
+        now: &LabelTerms,
+        before: Option<&LabelTerms>,
         whitening: Whitening,
     ) -> [ResidualRow; 2] {
         let Whitening { kept, sd_px } = whitening;
@@ -122,7 +122,7 @@ impl FlightState {
 
 /// A label's residual and the unknowns of the chain that it depends on.
 #[derive(Clone, Copy, Debug)]
-struct LabelRow {
+struct LabelTerms {
     first: usize,
     weights: [f64; SPAN],
     seen: LabelResidual,
@@ -132,15 +132,15 @@ struct LabelRow {
 /// A label's residual less the share `kept` of the residual before it, divided by the deviation of
 /// the remainder.
 fn whitened_residual(
-    now: &LabelRow,
-    before: Option<&LabelRow>,
+    now: &LabelTerms,
+    before: Option<&LabelTerms>,
     Whitening { kept, sd_px }: Whitening,
 ) -> [f64; 2] {
     let carried = before.map_or(Vector2::zeros(), |before| before.seen.residual * kept);
     ((now.seen.residual - carried) / sd_px).into()
 }
 
-impl LabelRow {
+impl LabelTerms {
     fn touched(&self) -> Touched {
         Touched::by(self.first, self.wander[0].0)
     }

@@ -13,13 +13,13 @@ const ROUNDS: usize = 6;
 /// A linear map from places to directions, `d ~ M X + m` with any matrix M, so that it also fits a
 /// camera whose lens or log is stretched.
 #[derive(Clone, Debug)]
-pub(super) struct LinearMap {
+pub(super) struct AffineMap {
     /// M, up to its scale.
     pub(super) matrix: Matrix3<f64>,
     shift: Vector3<f64>,
 }
 
-impl LinearMap {
+impl AffineMap {
     /// The map with the sign that puts most places ahead of the camera.
     fn new(matrix: Matrix3<f64>, shift: Vector3<f64>, pairs: &[DirectionToPlace]) -> Self {
         let is_ahead = |(direction, place): &&DirectionToPlace| {
@@ -79,10 +79,10 @@ fn quantile(numbers: impl Iterator<Item = f64>, share: f64) -> f64 {
 
 /// The map that most pairs fit: outliers, such as birds among the labels, are given less weight
 /// from round to round.
-pub(super) fn robust(pairs: &[DirectionToPlace]) -> Option<LinearMap> {
+pub(super) fn robust(pairs: &[DirectionToPlace]) -> Option<AffineMap> {
     let axes = Normalised::of(pairs)?;
     let mut weights = vec![1.0; pairs.len()];
-    let mut best: Option<(f64, LinearMap)> = None;
+    let mut best: Option<(f64, AffineMap)> = None;
     for _ in 0..ROUNDS {
         let linear = axes.in_space(pairs, &weights)?;
         let misfit = linear.typical_misfit(pairs);
@@ -101,13 +101,13 @@ pub(super) fn robust(pairs: &[DirectionToPlace]) -> Option<LinearMap> {
 const LEAST_RAD: f64 = 1e-5;
 
 /// The direct linear transformation: `d x (M X + m) = 0` for every direction d and place X.
-pub(super) fn in_space(pairs: &[DirectionToPlace]) -> Option<LinearMap> {
+pub(super) fn in_space(pairs: &[DirectionToPlace]) -> Option<AffineMap> {
     Normalised::of(pairs)?.in_space(pairs, &vec![1.0; pairs.len()])
 }
 
 /// The same for places in a plane, as of a flight at one height: the third axis follows from the
 /// first two.
-pub(super) fn in_plane(pairs: &[DirectionToPlace]) -> Option<LinearMap> {
+pub(super) fn in_plane(pairs: &[DirectionToPlace]) -> Option<AffineMap> {
     Normalised::of(pairs)?.in_plane(pairs)
 }
 
@@ -152,16 +152,16 @@ impl Normalised {
         matrix: &Matrix3<f64>,
         shift: &Vector3<f64>,
         pairs: &[DirectionToPlace],
-    ) -> LinearMap {
+    ) -> AffineMap {
         // d ~ N A' (X - c) / s + n, with N and n of the normalised places: up to the factor s,
         // M = N A' and m = s n - M c.
         let from_world = matrix * self.axes.transpose();
         let shift = shift * self.scale - from_world * self.middle.coords;
-        LinearMap::new(from_world, shift, pairs)
+        AffineMap::new(from_world, shift, pairs)
     }
 
     /// See [`in_space`]; each pair counts with its weight.
-    fn in_space(&self, pairs: &[DirectionToPlace], weights: &[f64]) -> Option<LinearMap> {
+    fn in_space(&self, pairs: &[DirectionToPlace], weights: &[f64]) -> Option<AffineMap> {
         let sum: SMatrix<f64, 12, 12> =
             squares(pairs.iter().zip(weights).map(|((direction, place), weight)| {
                 let place = self.place(*place);
@@ -175,7 +175,7 @@ impl Normalised {
     }
 
     /// See [`in_plane`].
-    fn in_plane(&self, pairs: &[DirectionToPlace]) -> Option<LinearMap> {
+    fn in_plane(&self, pairs: &[DirectionToPlace]) -> Option<AffineMap> {
         let sum: SMatrix<f64, 9, 9> = squares(pairs.iter().map(|(direction, place)| {
             let place = self.place(*place);
             (direction, [place.x, place.y, 1.0], 1.0)

@@ -22,14 +22,14 @@ pub struct MovedAt {
 }
 
 /// The mean of a second's residuals.
-struct SecondMean {
+struct OneSecondMean {
     time_s: f64,
     mean: Vector2<f64>,
 }
 
-fn blocks(labels: &[FittedLabel]) -> Vec<SecondMean> {
+fn blocks(labels: &[FittedLabel]) -> Vec<OneSecondMean> {
     let number = |label: &FittedLabel| (label.own_time_s / BLOCK_S).floor();
-    let block = |chunk: &[FittedLabel]| SecondMean {
+    let block = |chunk: &[FittedLabel]| OneSecondMean {
         time_s: chunk[0].own_time_s,
         mean: chunk.iter().map(|label| label.beside_px).sum::<Vector2<f64>>() / chunk.len() as f64,
     };
@@ -38,7 +38,7 @@ fn blocks(labels: &[FittedLabel]) -> Vec<SecondMean> {
 
 /// The medians of some blocks' means, axis by axis, and the sum of the absolute deviations from
 /// them, mean of both axes, pixels.
-fn middle(blocks: &[SecondMean]) -> (Vector2<f64>, f64) {
+fn middle(blocks: &[OneSecondMean]) -> (Vector2<f64>, f64) {
     let axis = |axis: usize| median(blocks.iter().map(|block| block.mean[axis]));
     let middle = Vector2::new(axis(0), axis(1));
     let away: f64 = blocks.iter().map(|block| (block.mean - middle).lp_norm(1)).sum();

@@ -94,7 +94,7 @@ impl Sights {
 
 /// Relative pose and clock offset of two cameras.
 #[derive(Clone, Debug)]
-pub(super) struct CameraPair {
+pub(super) struct RelativePose {
     /// The time by the first's clock less that by the second's, s.
     pub(super) ahead_s: f64,
     pub(super) first_from_second: Rotation3<f64>,
@@ -148,7 +148,7 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
 
 /// Possible relative poses of two cameras: a flight in a plane allows two. Empty where they saw too
 /// little in common.
-pub(super) fn find(first: &Sights, second: &Sights) -> Vec<CameraPair> {
+pub(super) fn find(first: &Sights, second: &Sights) -> Vec<RelativePose> {
     let Some((ahead_s, misfit_rad)) = offset(first, second, |seen| essential(seen).1) else {
         return Vec::new();
     };
@@ -163,7 +163,7 @@ pub(super) fn known(
     first: &Sights,
     second: &Sights,
     [a, b]: [(&Rotation3<f64>, Point3<f64>); 2],
-) -> Option<CameraPair> {
+) -> Option<RelativePose> {
     let second_from_first = (b.0.inverse() * a.0).into_inner();
     let shift = b.0.inverse() * (a.1 - b.1);
     // E = [t]x R, with the second's frame from the first's: b ~ R a + t.
@@ -171,7 +171,7 @@ pub(super) fn known(
     let (ahead_s, misfit_rad) = offset(first, second, |seen| misfit(&matrix, seen))?;
     let seen = common(first, second, ahead_s);
     let unit = shift.try_normalize(1e-9)?;
-    Some(CameraPair::of((second_from_first, unit), &seen, ahead_s, misfit_rad)?.1)
+    Some(RelativePose::of((second_from_first, unit), &seen, ahead_s, misfit_rad)?.1)
 }
 
 /// The clock offset (s) at which what both see fits best, and its misfit.
@@ -217,7 +217,7 @@ fn best_offset(
 
 /// Of the four poses that an essential matrix allows, the one with most of the target ahead of both
 /// cameras.
-fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Option<CameraPair> {
+fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Option<RelativePose> {
     // E = U diag(1, 1, 0) V': R = U W V' or U W' V' with W a quarter turn about z, and t = +-u3.
     let factors = essential(seen).0.svd(true, true);
     let (mut u, mut v_t) = (factors.u?, factors.v_t?);
@@ -234,23 +234,23 @@ fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Opti
         let second_from_first = u * quarter * v_t;
         [along, -along].map(|shift| (second_from_first, shift))
     });
-    let pairs = poses.filter_map(|pose| CameraPair::of(pose, seen, ahead_s, misfit_rad));
+    let pairs = poses.filter_map(|pose| RelativePose::of(pose, seen, ahead_s, misfit_rad));
     pairs.max_by_key(|(ahead, _)| *ahead).map(|(_, pair)| pair)
 }
 
 /// The poses of a flight in a plane, if a plane explains it about as well.
-fn in_plane(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Vec<CameraPair> {
+fn in_plane(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Vec<RelativePose> {
     let Some((matrix, in_plane_rad)) = plane::homography(seen) else { return Vec::new() };
     if in_plane_rad > PLANE_TIMES * misfit_rad {
         return Vec::new();
     }
     let pairs = plane::poses(&matrix, seen).into_iter().filter_map(|(turn, shift)| {
-        CameraPair::of((turn, shift.try_normalize(1e-9)?), seen, ahead_s, in_plane_rad)
+        RelativePose::of((turn, shift.try_normalize(1e-9)?), seen, ahead_s, in_plane_rad)
     });
     pairs.map(|(_, pair)| pair).collect()
 }
 
-impl CameraPair {
+impl RelativePose {
     /// The median angle by which the two cameras' sight lines pass each other, rad; `None` where
     /// too few are simultaneous.
     pub(super) fn aside(&self, first: &Sights, second: &Sights) -> Option<f64> {

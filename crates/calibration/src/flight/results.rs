@@ -128,7 +128,7 @@ pub(super) fn results(
 ) -> Option<FlightResult> {
     let ratios = halves::ratios(flight, priors, &adjusted);
     let followers = Followers::of(&adjusted.state);
-    let shown = followers.shown(adjusted.covariance.information())?;
+    let shown = followers.estimator(adjusted.covariance.information())?;
     let mut prior_information = adjusted.state.of_linear_jerk(priors);
     if flight.log.is_none() {
         prior_information += Gauge::information();

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
 use super::course::Course;
-use super::linear::{self, DirectionToPlace, LinearMap};
+use super::linear::{self, AffineMap, DirectionToPlace};
 use super::model::frame_time;
 use super::model::{CameraLabels, CameraUnknowns, ClockModel, Label};
 use super::pieces;
@@ -29,7 +29,7 @@ const FOLLOWED: usize = 12;
 
 /// A possible pose, and how much the camera's clock is behind the common time.
 #[derive(Clone, Debug)]
-struct StartPose {
+struct CandidateStart {
     rotation: Rotation3<f64>,
     centre: Point3<f64>,
     offset_s: f64,
@@ -125,7 +125,7 @@ pub(super) fn without_others(
     let (pieces, mut labels) = pieces::of_one_thing(camera, frame_time(camera));
     let CameraUnknowns { rotation, centre, clock, .. } = state;
     let (rotation, centre) = (*rotation, *centre);
-    let start = StartPose { rotation, centre, offset_s: clock.offset_s, misfit: 0.0 };
+    let start = CandidateStart { rotation, centre, offset_s: clock.offset_s, misfit: 0.0 };
     let near = |piece: &&Vec<Label>| start.lies_near(camera, piece, course, NEAR_RAD);
     labels.extend(pieces.iter().filter(near).flatten());
     of_labels(camera, labels)
@@ -139,12 +139,12 @@ pub(super) fn of_labels(camera: &CameraLabels, mut labels: Vec<Label>) -> Camera
 }
 
 /// The best pose over all offsets: begun with linear solutions of some rays, refined with all.
-fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<StartPose> {
-    let mut found: Vec<StartPose> =
+fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<CandidateStart> {
+    let mut found: Vec<CandidateStart> =
         offsets(some, course)?.flat_map(|offset_s| candidates(some, course, offset_s)).collect();
     found.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
     let cleaned = found.iter().take(CLEANED).filter_map(|one| cleaned(some, course, one.offset_s));
-    let cleaned: Vec<StartPose> = cleaned.collect();
+    let cleaned: Vec<CandidateStart> = cleaned.collect();
     found.extend(cleaned);
     found.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
     let followed = found.into_iter().take(FOLLOWED);
@@ -203,15 +203,15 @@ fn rays(camera: &CameraLabels, labels: &[Label]) -> Vec<Ray> {
 }
 
 /// The linear solutions at a clock offset.
-fn candidates(rays: &[Ray], course: &Course, offset_s: f64) -> Vec<StartPose> {
+fn candidates(rays: &[Ray], course: &Course, offset_s: f64) -> Vec<CandidateStart> {
     let Some(pairs) = seen_at(rays, course, offset_s) else { return Vec::new() };
     let maps = [linear::in_space(&pairs), linear::in_plane(&pairs)].into_iter().flatten();
-    maps.filter_map(|map| StartPose::of(&map, &pairs, offset_s)).collect()
+    maps.filter_map(|map| CandidateStart::of(&map, &pairs, offset_s)).collect()
 }
 
 /// The linear map that fits the labels best over all offsets, whatever its lens and its log's axes,
 /// and the misfit that most labels stay below, rad.
-pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(LinearMap, f64)> {
+pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(AffineMap, f64)> {
     let rays = rays(camera, &pieces::longest(camera, frame_time(camera)));
     let maps = offsets(&rays, course)?.filter_map(|offset_s| {
         let pairs = seen_at(&rays, course, offset_s)?;
@@ -223,9 +223,9 @@ pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(LinearMa
 }
 
 /// The linear solution at a clock offset with outliers given less weight.
-fn cleaned(rays: &[Ray], course: &Course, offset_s: f64) -> Option<StartPose> {
+fn cleaned(rays: &[Ray], course: &Course, offset_s: f64) -> Option<CandidateStart> {
     let pairs = seen_at(rays, course, offset_s)?;
-    StartPose::of(&linear::robust(&pairs)?, &pairs, offset_s)
+    CandidateStart::of(&linear::robust(&pairs)?, &pairs, offset_s)
 }
 
 /// Directions with the target's places at a clock offset, if there are enough.
@@ -239,8 +239,8 @@ fn seen_at(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Vec<Direction
     (pairs.len() >= enough).then_some(pairs)
 }
 
-impl StartPose {
-    fn of(map: &LinearMap, pairs: &[DirectionToPlace], offset_s: f64) -> Option<Self> {
+impl CandidateStart {
+    fn of(map: &AffineMap, pairs: &[DirectionToPlace], offset_s: f64) -> Option<Self> {
         let (rotation, centre) = map.pose()?;
         let misfit = linear::typical(angles(pairs, &rotation, centre));
         Some(Self { rotation, centre, offset_s, misfit })
@@ -276,9 +276,14 @@ fn angles(
 
 /// Gauss-Newton refinement of pose and offset against the log's trajectory, with weights against
 /// outliers; `None` if too few rays fall into the course.
-fn refined(start: StartPose, rays: &[Ray], course: &Course, frame_s: f64) -> Option<StartPose> {
+fn refined(
+    start: CandidateStart,
+    rays: &[Ray],
+    course: &Course,
+    frame_s: f64,
+) -> Option<CandidateStart> {
     const STEPS: usize = 25;
-    let mut best: Option<StartPose> = None;
+    let mut best: Option<CandidateStart> = None;
     let mut now = start;
     for _ in 0..STEPS {
         let scale = now.misfit.max(1e-4);

@@ -11,7 +11,7 @@ use super::course::Course;
 use super::error::LEAST_LABELS;
 use super::model::frame_time;
 use super::model::{CameraLabels, Label};
-use super::pairs::{self, CameraPair, Sights};
+use super::pairs::{self, RelativePose, Sights};
 use super::{pieces, start, triangulation};
 use crate::survey::Survey;
 
@@ -101,7 +101,7 @@ impl<'a> Things<'a> {
 struct Joined {
     cameras: [usize; 2],
     pieces: [Vec<usize>; 2],
-    pair: CameraPair,
+    pair: RelativePose,
     labels: usize,
 }
 
@@ -153,7 +153,7 @@ fn seeds(things: &[Things<'_>], survey: &Survey) -> Vec<Joined> {
 }
 
 /// Possible relative poses of two cameras: from an earlier calibration, or from what they saw.
-fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> Vec<CameraPair> {
+fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> Vec<RelativePose> {
     match cameras.map(|camera| survey.known(&camera.name)) {
         [Some(a), Some(b)] => {
             let poses = [a, b].map(|known| known.camera.pose());

@@ -7,7 +7,7 @@ use crossfix_message::CameraName;
 use nalgebra::Matrix3;
 
 use super::course::Course;
-use super::linear::LinearMap;
+use super::linear::AffineMap;
 use super::model::CameraLabels;
 use super::model::frame_time;
 use super::start;
@@ -99,9 +99,8 @@ pub(super) fn find(
     misfit: f64,
 ) -> Option<WouldFit> {
     let better = |found: f64| found * CLEARLY_BETTER < misfit && found < FITS_RAD;
-    if start::find(camera, &course.mirrored(), frame_time(camera))
-        .is_some_and(|(_, found)| better(found))
-    {
+    let mirrored = start::find(camera, &course.mirrored(), frame_time(camera));
+    if mirrored.is_some_and(|(_, found)| better(found)) {
         return Some(WouldFit::MirrorImage);
     }
     // Where any linear map fits, the labels are of the right target.
@@ -153,7 +152,7 @@ fn with_focal(camera: &CameraLabels, course: &Course, times: f64) -> f64 {
 
 /// The log's odd axis: a place X is seen along M X, so the log's axes are right where M' M is the
 /// identity (up to scale).
-fn stretched(map: &LinearMap) -> Option<WouldFit> {
+fn stretched(map: &AffineMap) -> Option<WouldFit> {
     // M = s R D^-1 for axes that are stretched by D, so that M' M = s^2 D^-2.
     let inverse = square(&(map.matrix.transpose() * map.matrix))?;
     let lengths = inverse.map(|square| square.sqrt().recip());
@@ -165,7 +164,7 @@ fn stretched(map: &LinearMap) -> Option<WouldFit> {
 
 /// The focal length relative to the file's: the image is M X, and M M' is the identity (up to
 /// scale) where it is right.
-fn zoomed(map: &LinearMap) -> Option<f64> {
+fn zoomed(map: &AffineMap) -> Option<f64> {
     let [x, y, ahead] = square(&(map.matrix * map.matrix.transpose()))?;
     // M = s diag(f, f, 1) R gives M M' = s^2 diag(f^2, f^2, 1).
     let times = ((x * y).sqrt() / ahead).sqrt();

@@ -4,7 +4,7 @@ use crossfix_geometry::{Camera, Pose};
 use nalgebra::{Matrix6, Point3, Vector2, Vector3};
 use serde::Serialize;
 
-use super::plan::{PlannedObserver, accuracy, prior};
+use super::plan::{TimedCamera, accuracy, prior};
 use super::{Assumptions, FisherInformation, PlannedCamera, Volume};
 
 /// Radii of the candidates' rings, relative to the cameras' median distance from the volume's
@@ -78,19 +78,19 @@ fn score(deviations: &mut [f64], fixed: usize) -> Score {
 }
 
 /// A cube of the sample with the present cameras' information on a target in it.
-struct KnownCube {
+struct SampleCube {
     point: Point3<f64>,
     cameras: usize,
     information: FisherInformation,
 }
 
-fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<KnownCube> {
+fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<SampleCube> {
     // Phases as if the candidate were the last of the list.
     let phase = |index: usize| index as f64 / (cameras.len() + 1) as f64;
-    let observers: Vec<PlannedObserver> = cameras
+    let observers: Vec<TimedCamera> = cameras
         .iter()
         .enumerate()
-        .map(|(index, camera)| PlannedObserver::new(camera, phase(index), assumptions))
+        .map(|(index, camera)| TimedCamera::new(camera, phase(index), assumptions))
         .collect();
     let stride = volume.centres().count().div_ceil(SAMPLE).max(1);
     let sample = volume.centres().step_by(stride);
@@ -99,17 +99,17 @@ fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) 
 
 fn known_cube(
     point: Point3<f64>,
-    observers: &[PlannedObserver<'_>],
+    observers: &[TimedCamera<'_>],
     assumptions: &Assumptions,
-) -> KnownCube {
+) -> SampleCube {
     let theirs: Vec<FisherInformation> =
         observers.iter().filter_map(|o| o.information(point)).collect();
     let mut information = prior(assumptions);
     theirs.iter().for_each(|one| information += one);
-    KnownCube { point, cameras: theirs.len(), information }
+    SampleCube { point, cameras: theirs.len(), information }
 }
 
-fn score_with(known: &[KnownCube], extra: Option<&PlannedObserver>, worst_m: f64) -> Score {
+fn score_with(known: &[SampleCube], extra: Option<&TimedCamera>, worst_m: f64) -> Score {
     let mut fixed = 0;
     let mut deviations: Vec<f64> = known
         .iter()
@@ -155,7 +155,7 @@ pub fn advise(
     let candidate = |ring: f64, direction: u32| {
         let place = on_ring(middle, ring * distance, height, direction);
         let more = moved(like, place, middle)?;
-        let observer = PlannedObserver::new(&more, phase, assumptions);
+        let observer = TimedCamera::new(&more, phase, assumptions);
         let score = score_with(&known, Some(&observer), worst_m);
         Some(CandidatePlace { position_m: place.into(), score })
     };

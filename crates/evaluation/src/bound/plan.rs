@@ -138,7 +138,7 @@ pub struct Cell {
 }
 
 /// A camera with the times of its bearings.
-pub(super) struct PlannedObserver<'a> {
+pub(super) struct TimedCamera<'a> {
     camera: &'a Camera,
     times: TimeOffsets,
     reach_m: f64,
@@ -146,7 +146,7 @@ pub(super) struct PlannedObserver<'a> {
     noise: PixelCovariance,
 }
 
-impl<'a> PlannedObserver<'a> {
+impl<'a> TimedCamera<'a> {
     /// A camera whose newest bearing is `phase` of its frame interval old; at least one bearing is
     /// in the window.
     pub(super) fn new(
@@ -201,10 +201,10 @@ pub(super) fn accuracy(cameras: usize, information: &FisherInformation) -> Optio
 /// The cameras are not synchronised: their phases are spread evenly.
 pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<Cell> {
     let phase = |index: usize| index as f64 / cameras.len() as f64;
-    let observers: Vec<PlannedObserver> = cameras
+    let observers: Vec<TimedCamera> = cameras
         .iter()
         .enumerate()
-        .map(|(index, camera)| PlannedObserver::new(camera, phase(index), assumptions))
+        .map(|(index, camera)| TimedCamera::new(camera, phase(index), assumptions))
         .collect();
     let centres = volume.centres();
     centres.map(|(layer, centre)| cell(layer, centre, &observers, assumptions)).collect()
@@ -213,7 +213,7 @@ pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumpt
 fn cell(
     layer: usize,
     centre: Point3<f64>,
-    observers: &[PlannedObserver<'_>],
+    observers: &[TimedCamera<'_>],
     assumptions: &Assumptions,
 ) -> Cell {
     let mut information = prior(assumptions);

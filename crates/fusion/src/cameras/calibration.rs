@@ -6,7 +6,7 @@ use crossfix_geometry::{Camera, PanTilt};
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix6, Point3};
 
-use crate::uncertainty::{CameraUncertainty, PoseUncertainty, SharedNoise};
+use crate::uncertainty::{CameraUncertainty, CorrelatedNoise, PoseUncertainty};
 
 /// Most calibrations of a camera that wait for their time. A camera that is moved by hand has one
 /// at most; of a clock that runs wild, those that lie farthest in the future are forgotten.
@@ -26,7 +26,7 @@ pub(crate) struct KnownCamera {
     /// Covariance of the pose in the world's axes: rotation (rad), then position (m).
     pub(crate) pose_covariance: Matrix6<f64>,
     /// The part of its bearings' noise that lasts.
-    pub(crate) lasting: SharedNoise,
+    pub(crate) lasting: CorrelatedNoise,
     /// Random walk of its clock, beside offset and drift, s^2/s.
     pub(crate) clock_walk: f64,
     /// Whether somebody has stated the uncertainty of the pose.
@@ -131,7 +131,7 @@ mod tests {
             is_turning: false,
             camera: Camera::new(intrinsics, pose).unwrap(),
             pose_covariance: Matrix6::identity(),
-            lasting: SharedNoise::NONE,
+            lasting: CorrelatedNoise::NONE,
             clock_walk: 0.0,
             is_declared: false,
         }

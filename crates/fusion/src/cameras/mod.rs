@@ -35,7 +35,7 @@ use calibration::Calibrations;
 use clutter::ClutterRate;
 use noise::WhiteNoise;
 use pose_scale::PoseScale;
-use rooted::RootedView;
+use rooted::ReportedPlaces;
 use standing::Standing;
 use watch::ErrorWatch;
 
@@ -87,7 +87,7 @@ pub(crate) struct CameraState {
     pose_scale: PoseScale,
     noise: WhiteNoise,
     clutter: ClutterRate,
-    view: RootedView,
+    view: ReportedPlaces,
     told_clock: Option<ToldClock>,
     /// By the targets that three others see.
     standing: Standing,
@@ -105,7 +105,7 @@ impl CameraState {
             pointed: None,
             noise: WhiteNoise::default(),
             clutter: ClutterRate::default(),
-            view: RootedView::new(rooted_s),
+            view: ReportedPlaces::new(rooted_s),
             told_clock: None,
             standing: Standing::default(),
             misfits: Standing::default(),

@@ -4,7 +4,7 @@ use crossfix_geometry::ScanAngles;
 use crossfix_message::Pointing;
 
 use super::KnownCamera;
-use crate::uncertainty::SharedNoise;
+use crate::uncertainty::CorrelatedNoise;
 
 /// How long the error of the angles that a mount reports lasts while the mount does not turn, s:
 /// longer than it looks in one direction. With a tenth of it a camera that stares at a target for a
@@ -60,7 +60,7 @@ impl KnownCamera {
 
 /// Lasting noise of a camera's bearings together with the error of its mount's angles: the larger
 /// of the two determines how long it lasts.
-fn with_pointing(lasting: SharedNoise, pointed: &Pointed) -> SharedNoise {
+fn with_pointing(lasting: CorrelatedNoise, pointed: &Pointed) -> CorrelatedNoise {
     let time_s = if pointed.sd_rad > lasting.sd_rad { DWELL_S } else { lasting.time_s };
-    SharedNoise { sd_rad: lasting.sd_rad.hypot(pointed.sd_rad), time_s }
+    CorrelatedNoise { sd_rad: lasting.sd_rad.hypot(pointed.sd_rad), time_s }
 }

@@ -38,29 +38,29 @@ pub(crate) enum Rooted {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct RootedPlace {
+struct ReportedPlace {
     middle: Unit<Vector3<f64>>,
     /// Where the middle was at [`Self::first`].
     start: Unit<Vector3<f64>>,
     first: Timestamp,
     last: Timestamp,
     reports: f64,
-    /// [`RootedView::exposures`] before its first report.
+    /// [`ReportedPlaces::exposures`] before its first report.
     before: f64,
 }
 
 /// The places in a camera's view from which it has reported something lately.
 #[derive(Clone, Debug)]
-pub(crate) struct RootedView {
+pub(crate) struct ReportedPlaces {
     /// An object that has stayed within reach of one direction for this long is rooted, s: a target
     /// that flies leaves it sooner, and one that hovers has been seen to come.
     rooted_s: f64,
-    places: Vec<RootedPlace>,
+    places: Vec<ReportedPlace>,
     began: Option<Timestamp>,
     exposures: f64,
 }
 
-impl RootedView {
+impl ReportedPlaces {
     /// The view of a camera that has not looked yet.
     pub(crate) fn new(rooted_s: f64) -> Self {
         Self { rooted_s, places: Vec::new(), began: None, exposures: 0.0 }
@@ -97,7 +97,7 @@ impl RootedView {
         let rooted_s = self.rooted_s;
         // What is there when a camera begins to look may have been there for long.
         let may_be_old = |first: Timestamp| first.seconds_since(began) < BEGINNING * rooted_s;
-        let distance = |place: &RootedPlace| {
+        let distance = |place: &ReportedPlace| {
             (place.middle.into_inner() - line.direction.into_inner()).norm_squared()
         };
         let near = self.places.iter_mut().map(|place| (distance(place), place));
@@ -108,7 +108,7 @@ impl RootedView {
                 self.places.remove(0);
             }
             let (middle, start) = (line.direction, line.direction);
-            self.places.push(RootedPlace {
+            self.places.push(ReportedPlace {
                 middle,
                 start,
                 first: time,

@@ -58,7 +58,7 @@ pub(super) struct Unknowns {
 
 /// Prior of the cameras' clocks and poses.
 #[derive(Clone, Debug)]
-pub(super) struct ClockPrior {
+pub(super) struct ClockAndPosePrior {
     pub(super) mean: DVector<f64>,
     pub(super) precision: DMatrix<f64>,
     /// Time at which the prior's offsets hold, s after the window's beginning.
@@ -95,7 +95,7 @@ struct Quadratic {
 
 /// Result of an adjustment.
 #[derive(Clone, Debug)]
-pub(super) struct AdjustedClocks {
+pub(super) struct AdjustedCameras {
     pub(super) cameras: DVector<f64>,
     pub(super) covariance: DMatrix<f64>,
     /// Factor on each camera's reported covariances: 1 where these agree with its residuals.
@@ -114,18 +114,22 @@ pub(super) struct AdjustedClocks {
 pub(super) struct Adjustment<'a> {
     sights: &'a [WindowBearing],
     curve: Curve,
-    prior: &'a ClockPrior,
+    prior: &'a ClockAndPosePrior,
     /// Factor on each camera's covariances.
     scales: Vec<f64>,
 }
 
 impl<'a> Adjustment<'a> {
-    pub(super) fn new(sights: &'a [WindowBearing], curve: Curve, prior: &'a ClockPrior) -> Self {
+    pub(super) fn new(
+        sights: &'a [WindowBearing],
+        curve: Curve,
+        prior: &'a ClockAndPosePrior,
+    ) -> Self {
         Self { sights, curve, prior, scales: vec![1.0; prior.cameras.len()] }
     }
 
     /// Fits trajectory, clocks and poses. `None` if the numbers fail.
-    pub(super) fn solve(mut self, density: i32) -> Option<AdjustedClocks> {
+    pub(super) fn solve(mut self, density: i32) -> Option<AdjustedCameras> {
         let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
         self.rescale(&state, Loss::Huber);
         let (mut state, mut density, mut evidence) = self.best_density(state, density)?;
@@ -135,7 +139,7 @@ impl<'a> Adjustment<'a> {
         let outlier_shares =
             self.squares(&state).iter().map(|squares| outlier_share(squares)).collect();
         let (covariance, pulled) = self.posterior(&state, density)?;
-        Some(AdjustedClocks {
+        Some(AdjustedCameras {
             cameras: state.cameras,
             covariance,
             scales: self.scales,

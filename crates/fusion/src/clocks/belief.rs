@@ -397,8 +397,8 @@ impl Belief {
     ) -> BTreeMap<usize, f64> {
         let mut row: BTreeMap<usize, f64> = BTreeMap::new();
         let others = self.shares().map(|(other, share)| (other, -share));
-        for (clock, weight) in std::iter::once((clock, 1.0)).chain(others) {
-            let Some(place) = clock.place.filter(|_| weight != 0.0) else { continue };
+        for (one, weight) in std::iter::once((clock, 1.0)).chain(others) {
+            let Some(place) = one.place.filter(|_| weight != 0.0) else { continue };
             *row.entry(place + component).or_default() += weight;
             if component == 0 {
                 *row.entry(place + 1).or_default() += weight * ahead;

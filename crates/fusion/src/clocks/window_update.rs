@@ -4,7 +4,7 @@
 use crossfix_message::CameraName;
 use nalgebra::DMatrix;
 
-use super::adjustment::{AdjustedClocks, Adjustment, ClockPrior, Unknowns};
+use super::adjustment::{AdjustedCameras, Adjustment, ClockAndPosePrior, Unknowns};
 use super::belief::Belief;
 use super::curve::Curve;
 use super::window::TrackWindow;
@@ -94,7 +94,7 @@ impl JumpTest<'_> {
             };
             let evidence = adjusted.evidence - JUMP;
             if best.as_ref().is_none_or(|(best, _)| evidence > best.evidence) {
-                best = Some((AdjustedClocks { evidence, ..adjusted }, doubting));
+                best = Some((AdjustedCameras { evidence, ..adjusted }, doubting));
             }
         }
         if let Some((adjusted, belief)) = best {
@@ -109,7 +109,7 @@ impl JumpTest<'_> {
         })
     }
 
-    fn learnt(&self, mut belief: Belief, adjusted: &AdjustedClocks) -> Belief {
+    fn learnt(&self, mut belief: Belief, adjusted: &AdjustedCameras) -> Belief {
         belief.learn(&self.components, &adjusted.cameras, &adjusted.covariance);
         belief
     }
@@ -117,9 +117,13 @@ impl JumpTest<'_> {
     /// The belief if a camera's clock has jumped in the first half of the window: its bearings of
     /// the second half then fit much better than all of them, and the clock as it was explains them
     /// no better.
-    fn jumped_within(&self, camera: &CameraName, plain: Option<&AdjustedClocks>) -> Option<Belief> {
+    fn jumped_within(
+        &self,
+        camera: &CameraName,
+        plain: Option<&AdjustedCameras>,
+    ) -> Option<Belief> {
         let index = self.window.cameras.iter().position(|known| known == camera)?;
-        let strange = |adjusted: &AdjustedClocks| adjusted.scales[index];
+        let strange = |adjusted: &AdjustedCameras| adjusted.scales[index];
         if plain.is_some_and(|plain| fits(plain) && strange(plain) < SUSPICIOUS_SCALE) {
             return None;
         }
@@ -137,7 +141,7 @@ impl JumpTest<'_> {
     }
 
     /// The cameras of the window whose clocks may have jumped, the least fitting first.
-    fn suspects(&self, adjusted: Option<&AdjustedClocks>) -> Vec<&CameraName> {
+    fn suspects(&self, adjusted: Option<&AdjustedCameras>) -> Vec<&CameraName> {
         let strange = |index: usize| {
             adjusted.map_or(0.0, |adjusted| {
                 adjusted.scales[index] + MAX_SCALE * adjusted.outlier_shares[index]
@@ -163,18 +167,18 @@ fn components(belief: &Belief, window: &TrackWindow) -> Vec<usize> {
     window.cameras.iter().flat_map(of_camera).collect()
 }
 
-fn fits(adjusted: &AdjustedClocks) -> bool {
+fn fits(adjusted: &AdjustedCameras) -> bool {
     adjusted.scales.iter().all(|scale| *scale < MAX_SCALE)
         && adjusted.outlier_shares.iter().all(|share| *share < MAX_OUTLIERS)
 }
 
-fn is_suspicious(adjusted: &AdjustedClocks) -> bool {
+fn is_suspicious(adjusted: &AdjustedCameras) -> bool {
     adjusted.scales.iter().any(|scale| *scale > SUSPICIOUS_SCALE)
         || adjusted.pulled > SUSPICIOUS_PULL * adjusted.cameras.len() as f64
 }
 
 /// Fits a window with the belief as the prior of clocks and poses.
-fn adjust(belief: &Belief, window: &TrackWindow, components: &[usize]) -> Option<AdjustedClocks> {
+fn adjust(belief: &Belief, window: &TrackWindow, components: &[usize]) -> Option<AdjustedCameras> {
     let (mean, covariance) = belief.marginal(components);
     let mut next = 0;
     let mut room = |place: Option<usize>, size: usize| {
@@ -198,7 +202,7 @@ fn adjust(belief: &Belief, window: &TrackWindow, components: &[usize]) -> Option
     let last = times().fold(f64::NEG_INFINITY, f64::max) + margin;
     let precision: DMatrix<f64> = covariance.cholesky()?.inverse();
     let epoch_s = belief.epoch()?.seconds_since(window.start);
-    let prior = ClockPrior { mean, precision, epoch_s, cameras };
+    let prior = ClockAndPosePrior { mean, precision, epoch_s, cameras };
     let reach = LONGEST_S + 2.0 * MAX_MARGIN_S;
     let curve = Curve::over(first, last.min(first + reach));
     Adjustment::new(&window.sights, curve, &prior).solve(FIRST_DENSITY)

@@ -12,7 +12,7 @@ use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
 use crate::cameras::Rooted;
 use crate::cameras::{Cameras, KnownCamera};
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
 use crate::track::{Track, TrackExpectation, TrackId, TrackStatus};
 use crate::tracker::same_target;
@@ -96,7 +96,7 @@ impl Hypothesis {
 struct HypothesisContext<'a> {
     exposure: &'a Exposure,
     known: &'a KnownCamera,
-    motion: &'a TrackMotion,
+    motion: &'a MotionSetup,
     lines: &'a [NamedLine],
     uncertainty: CameraUncertainty,
     detection: f64,
@@ -137,7 +137,7 @@ impl Hypotheses {
         &mut self,
         exposures: &[&Exposure],
         cameras: &Cameras,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Vec<Start> {
         self.period += 1;
         for exposure in exposures {
@@ -167,7 +167,7 @@ impl Hypotheses {
     }
 
     /// Continues every hypothesis with each bearing in its gate, and without any.
-    fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &TrackMotion) {
+    fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &MotionSetup) {
         let lines: Vec<NamedLine> = lines_of(exposure).collect();
         let uncertainty = CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty };
         let detection = self.tracking.detection_probability;
@@ -290,7 +290,7 @@ impl Hypotheses {
     }
 
     /// Starts a hypothesis from every seed.
-    fn begin(&mut self, seeds: Vec<Seed>, exposures: &[&Exposure], motion: &TrackMotion) {
+    fn begin(&mut self, seeds: Vec<Seed>, exposures: &[&Exposure], motion: &MotionSetup) {
         let uncertainty: BTreeMap<&CameraName, CameraUncertainty> = exposures
             .iter()
             .map(|exposure| {
@@ -366,7 +366,7 @@ impl Hypotheses {
     /// have no rival. The log-likelihood ratio of one target against a target per camera must reach
     /// `pairs`, the logarithm of the number of pairs of lines that may look like one target by
     /// chance.
-    fn confirm(&mut self, now: Timestamp, pairs: f64, motion: &TrackMotion) -> Vec<Start> {
+    fn confirm(&mut self, now: Timestamp, pairs: f64, motion: &MotionSetup) -> Vec<Start> {
         // Sorted by score: the rest have scores of 0 and less, which are never chosen.
         let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
         let scored = likely.map(|h| (h.track.score, h.lines.as_slice()));

@@ -20,7 +20,7 @@ use nalgebra::Vector3;
 
 use crate::cameras::{Cameras, KnownCamera};
 use crate::cueing::CueTarget;
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::papers::Grouped;
 use crate::spatial::{LineId, TimedLine};
 use crate::track::{Track, TrackId};
@@ -100,7 +100,7 @@ impl Initiator {
         exposure: &Exposure,
         used: &[(usize, TrackId)],
         known: &KnownCamera,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Vec<Start> {
         match self.method {
             Method::Hypotheses(_) => self.handover.see(exposure, used, known, motion),
@@ -115,7 +115,7 @@ impl Initiator {
         exposure: Exposure,
         claims: &[(usize, TrackId)],
         cameras: &Cameras,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Vec<Start> {
         if let Method::Hypotheses(hypotheses) = &mut self.method {
             hypotheses.claim(&exposure, claims);

@@ -27,7 +27,7 @@ const DENSITY: f64 = 1e-6;
 const CLEARLY: f64 = 100.0;
 
 /// A track of a neighbour: which neighbour, and under which number it says it.
-pub(super) type NeighbourTrack = (usize, Number);
+pub(super) type NeighbourTrackId = (usize, Number);
 
 /// How well the places of two tracks have agreed lately, as means over about [`LONG_ENOUGH_S`].
 #[derive(Clone, Copy, Debug)]
@@ -61,14 +61,14 @@ impl TrackLikeness {
 
 /// All pairs of tracks that may be of one target.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Likenesses(BTreeMap<(Own, NeighbourTrack), TrackLikeness>);
+pub(super) struct Likenesses(BTreeMap<(Own, NeighbourTrackId), TrackLikeness>);
 
 impl Likenesses {
     /// Compares two states of one time; `is_one` is for tracks that are said under one number,
     /// whose pair is kept whatever comes out.
     pub(super) fn see(
         &mut self,
-        pair: (Own, NeighbourTrack),
+        pair: (Own, NeighbourTrackId),
         is_one: bool,
         [here, there]: [&KinematicState; 2],
         now: Timestamp,
@@ -98,7 +98,7 @@ impl Likenesses {
         }
     }
 
-    fn of_own(&self, own: Own) -> impl Iterator<Item = (NeighbourTrack, &TrackLikeness)> {
+    fn of_own(&self, own: Own) -> impl Iterator<Item = (NeighbourTrackId, &TrackLikeness)> {
         let all = (own, (0, Number(0)))..=(own, (usize::MAX, Number(u64::MAX)));
         self.0.range(all).map(|((_, said), likeness)| (*said, likeness))
     }
@@ -109,7 +109,7 @@ impl Likenesses {
         &self,
         own: Own,
         now: Timestamp,
-    ) -> impl Iterator<Item = NeighbourTrack> + '_ {
+    ) -> impl Iterator<Item = NeighbourTrackId> + '_ {
         self.of_own(own)
             .filter(move |(said, likeness)| self.is_sure((own, *said), likeness, now))
             .map(|(said, _)| said)
@@ -117,7 +117,7 @@ impl Likenesses {
 
     fn is_sure(
         &self,
-        (own, said): (Own, NeighbourTrack),
+        (own, said): (Own, NeighbourTrackId),
         likeness: &TrackLikeness,
         now: Timestamp,
     ) -> bool {
@@ -139,12 +139,12 @@ impl Likenesses {
     }
 
     /// Whether two tracks that are said under one number are near enough to be of one target.
-    pub(super) fn may_be_one(&self, own: Own, said: NeighbourTrack) -> bool {
+    pub(super) fn may_be_one(&self, own: Own, said: NeighbourTrackId) -> bool {
         self.0.get(&(own, said)).is_some_and(|likeness| likeness.distance < PARTED)
     }
 
     /// Whether two tracks that are said under one number are of two targets, beyond doubt.
-    pub(super) fn have_parted(&self, own: Own, said: NeighbourTrack) -> bool {
+    pub(super) fn have_parted(&self, own: Own, said: NeighbourTrackId) -> bool {
         let likeness = self.0.get(&(own, said));
         likeness.is_some_and(|likeness| likeness.has_lasted() && likeness.distance > PARTED)
     }

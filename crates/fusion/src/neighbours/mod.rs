@@ -30,7 +30,7 @@ use crossfix_message::{
 
 use crate::{FusionConfig, Output};
 use known::{Grip, KEPT_EVERY_S, Ours, Theirs, Voice, event, state_of};
-use likeness::{Likenesses, NeighbourTrack};
+use likeness::{Likenesses, NeighbourTrackId};
 
 /// A track of which nothing has been heard for this long is no longer said, s: each is said at
 /// least every half second. With half of it a message that is lost ends the track; with twice as
@@ -97,7 +97,7 @@ pub struct Neighbours {
     now: Option<Timestamp>,
     /// The newest time that each neighbour has said.
     newest: BTreeMap<usize, Timestamp>,
-    theirs: BTreeMap<NeighbourTrack, Theirs>,
+    theirs: BTreeMap<NeighbourTrackId, Theirs>,
     ours: BTreeMap<Own, Ours>,
     likenesses: Likenesses,
     numbered: u64,
@@ -151,7 +151,7 @@ impl Neighbours {
 
     /// Whether a neighbour says a track now: by the neighbour's own time it has done so lately, and
     /// by the time here it has not fallen silent.
-    fn is_said(&self, (index, _): NeighbourTrack, theirs: &Theirs) -> bool {
+    fn is_said(&self, (index, _): NeighbourTrackId, theirs: &Theirs) -> bool {
         let newest = self.newest.get(&index).copied().unwrap_or(theirs.time);
         let silent_s = match (self.now, theirs.heard) {
             (Some(now), Some(heard)) => now.seconds_since(heard),
@@ -263,7 +263,7 @@ impl Neighbours {
     }
 
     /// The neighbours' tracks of a number that are said now.
-    fn of_number(&self, number: Number) -> impl Iterator<Item = (NeighbourTrack, &Theirs)> {
+    fn of_number(&self, number: Number) -> impl Iterator<Item = (NeighbourTrackId, &Theirs)> {
         let of_neighbour = move |index: &usize| {
             let (said, theirs) = self.theirs.get_key_value(&(*index, number))?;
             self.is_said(*said, theirs).then_some((*said, theirs))
@@ -276,7 +276,7 @@ impl Neighbours {
     fn settle_number(&mut self, own: Own, now: Timestamp) -> Option<Number> {
         let ours = self.ours.get(&own)?;
         let has_parted =
-            |(said, _): (NeighbourTrack, &Theirs)| self.likenesses.have_parted(own, said);
+            |(said, _): (NeighbourTrackId, &Theirs)| self.likenesses.have_parted(own, said);
         if ours.is_taken() && self.of_number(ours.number).any(has_parted) {
             let ours = self.ours.get_mut(&own)?;
             ((ours.number, ours.born), ours.voice) = (ours.first, Voice::Unsaid);

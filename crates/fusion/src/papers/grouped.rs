@@ -6,7 +6,7 @@ use super::fixes::{FixFinder, SPEED_SIGMAS};
 use super::grouping::{Group, Grouping, GroupingRules, TemporalGate};
 use crate::cameras::Cameras;
 use crate::initiation::{NamedLine, Start};
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::spatial::{Fix, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
 use crate::track::Track;
 use crate::uncertainty::CameraUncertainty;
@@ -44,7 +44,7 @@ impl Grouped {
         &mut self,
         exposures: &[&Exposure],
         cameras: &Cameras,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Vec<Start> {
         let groups = self.grouping.advance(&self.finder.fixes(exposures, cameras));
         let tracks = groups.iter().filter_map(|group| start(group, motion));
@@ -59,7 +59,7 @@ impl Grouped {
 }
 
 /// A tentative track: started from a group's first fix, updated with the lines of the later ones.
-fn start(group: &Group, motion: &TrackMotion) -> Option<Track> {
+fn start(group: &Group, motion: &MotionSetup) -> Option<Track> {
     let (fix, later) = starting_point(group)?;
     let vague = Fix { state: vague_velocity(fix), ..fix.clone() };
     let named = group

@@ -6,7 +6,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Point3;
 
 use super::{Track, log_range_sd};
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::prediction::{BearingFit, BearingPrediction};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
@@ -59,7 +59,7 @@ impl Track {
         time: Timestamp,
         (camera, origin): (&CameraName, Point3<f64>),
         uncertainty: &CameraUncertainty,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Option<TrackExpectation> {
         let interval = time.seconds_since(self.updated);
         let errors = self.errors_of(camera, interval);

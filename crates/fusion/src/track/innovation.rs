@@ -6,7 +6,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Vector2;
 
 use super::Track;
-use crate::motion::{ManoeuvreDetector, TrackMotion};
+use crate::motion::{ManoeuvreDetector, MotionSetup};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
 /// The innovation of a bearing.
@@ -66,7 +66,7 @@ impl Track {
         interval: f64,
         (camera, line): (&CameraName, &SightLine),
         uncertainty: &CameraUncertainty,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Option<f64> {
         let before = self.imm.predicted(interval, motion.models(self.ranged));
         let errors = self.errors_of(camera, interval);
@@ -82,7 +82,7 @@ impl Track {
         interval: f64,
         (line, errors): (&SightLine, &SharedErrors),
         uncertainty: &CameraUncertainty,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Option<SharedErrors> {
         let (anew, probability) = errors.renewed()?;
         let before = self.imm.predicted(interval, motion.models(self.ranged));
@@ -103,7 +103,7 @@ impl Track {
         interval: f64,
         (camera, line): (&CameraName, &SightLine),
         uncertainty: &CameraUncertainty,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> bool {
         let nis = matches!(self.detector, Some(ManoeuvreDetector::Innovation(_)))
             .then(|| self.nis(innovation, interval, (camera, line), uncertainty, motion))

@@ -15,7 +15,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, Dyn, Matrix2, Matrix6, OMatrix, U2, U5, U6, Vector2};
 
 use super::{Ties, Track};
-use crate::uncertainty::{CONSIDERED, LASTING, SharedCovariance, SharedErrors, SharedNoise};
+use crate::uncertainty::{CONSIDERED, CorrelatedNoise, LASTING, SharedCovariance, SharedErrors};
 use crate::update::Told;
 
 /// Most cameras whose lasting errors a track learns, as an update's cost grows with the square of
@@ -129,7 +129,7 @@ impl Track {
     pub(super) fn begin_to_learn(
         &mut self,
         camera: &CameraName,
-        lasting: SharedNoise,
+        lasting: CorrelatedNoise,
         now: Timestamp,
     ) {
         if lasting.sd_rad <= 0.0 || !self.is_confirmed() || self.learnt.row_of(camera).is_some() {

@@ -9,7 +9,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2x5, Matrix6, Matrix6x2, Vector6};
 
 use super::Track;
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::uncertainty::{LASTING, SharedTies};
 use crate::update::Told;
 
@@ -53,7 +53,7 @@ impl PastState {
 
     /// Updates the past state with a bearing of a camera; `seen` says how the bearing is correlated
     /// with each camera's errors.
-    fn learn(&mut self, camera: &CameraName, told: &Told, seen: &[BearingCovariance<'_>]) {
+    fn learn(&mut self, camera: &CameraName, told: &Told, seen: &[BearingErrorCovariance<'_>]) {
         let own = *self.ties_to(camera);
         // A = cov(past, bearing) = N' H' + X J', with N = `with_now` and X the ties to the
         // bearing's camera. Mean += A S^-1 z; covariance -= A (S^-1 - spread over the models) A'.
@@ -73,7 +73,7 @@ impl PastState {
         self.with_now = told.carried * self.with_now - told.gained * own.transpose()
             + told.moved * across.transpose();
         let gain = across * told.weight;
-        for BearingCovariance { camera, by_errors, is_learnt } in seen {
+        for BearingErrorCovariance { camera, by_errors, is_learnt } in seen {
             let change = if *is_learnt {
                 let mut change = gain * by_errors;
                 let mut lasting = change.fixed_columns_mut::<2>(LASTING);
@@ -117,7 +117,7 @@ impl PastState {
 }
 
 /// The covariance of a bearing with the shared errors of one camera.
-struct BearingCovariance<'a> {
+struct BearingErrorCovariance<'a> {
     camera: &'a CameraName,
     by_errors: Matrix2x5<f64>,
     /// Whether the camera's lasting errors are learnt.
@@ -126,7 +126,7 @@ struct BearingCovariance<'a> {
 
 impl Track {
     /// Stores the track's state at a time, so that later bearings can smooth it.
-    pub(crate) fn remember(&mut self, time: Timestamp, motion: &TrackMotion) {
+    pub(crate) fn remember(&mut self, time: Timestamp, motion: &MotionSetup) {
         let state = self.predicted(time, motion);
         let interval = time.seconds_since(self.updated);
         let ties =
@@ -189,10 +189,10 @@ impl Track {
         if self.past.is_empty() {
             return;
         }
-        let seen: Vec<BearingCovariance<'_>> = self
+        let seen: Vec<BearingErrorCovariance<'_>> = self
             .ties
             .iter()
-            .map(|(name, ties)| BearingCovariance {
+            .map(|(name, ties)| BearingErrorCovariance {
                 camera: name,
                 by_errors: told.by * ties.covariance + told.shifts * self.between(camera, name),
                 is_learnt: self.learns(name),

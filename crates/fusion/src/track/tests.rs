@@ -7,7 +7,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::*;
 use crate::spatial::tests_support::{line_at, noisy_line_at, orthogonal_cameras};
 use crate::spatial::{VelocityKnowledge, map};
-use crate::uncertainty::SharedNoise;
+use crate::uncertainty::CorrelatedNoise;
 use crate::{Manoeuvres, Tracking};
 
 /// Mean NEES after five periods of the papers' geometry, started from the MAP fix of the first one.
@@ -22,7 +22,7 @@ fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
         acceleration_density: 1e-9,
         ..Tracking::default()
     };
-    let motion = TrackMotion::new(&tracking).unwrap();
+    let motion = MotionSetup::new(&tracking).unwrap();
     let name: CameraName = "a".parse().unwrap();
     let (mut nees, mut square) = (0.0, 0.0);
     for _ in 0..RUNS {
@@ -71,12 +71,12 @@ fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
 
 /// Lasting errors of the bearings of three cameras, thirty a second each.
 struct LastingErrors {
-    noise: SharedNoise,
+    noise: CorrelatedNoise,
     errors: [Vector2<f64>; 3],
 }
 
 impl LastingErrors {
-    fn new(noise: SharedNoise, normal: &mut impl FnMut() -> f64) -> Self {
+    fn new(noise: CorrelatedNoise, normal: &mut impl FnMut() -> f64) -> Self {
         let errors = std::array::from_fn(|_| Vector2::new(normal(), normal()) * noise.sd_rad);
         Self { noise, errors }
     }
@@ -127,8 +127,8 @@ fn flown(
         acceleration_density: DENSITY,
         ..Tracking::default()
     };
-    let motion = TrackMotion::new(&tracking).unwrap();
-    let noise = SharedNoise { sd_rad: 3e-4, time_s: 1.0 };
+    let motion = MotionSetup::new(&tracking).unwrap();
+    let noise = CorrelatedNoise { sd_rad: 3e-4, time_s: 1.0 };
     let uncertainty = CameraUncertainty { lasting: noise, ..CameraUncertainty::of_time(0.0) };
     let mut errors = LastingErrors::new(noise, normal);
     let names: [CameraName; 3] = ["a", "b", "c"].map(|name| name.parse().unwrap());

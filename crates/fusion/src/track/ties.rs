@@ -12,13 +12,15 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Unit, Vector2, Vector3};
 use super::learnt::LearntTies;
 use super::{BearingInnovation, Track};
 use crate::cameras::{ClockChange, LastThree, ScaleSample};
-use crate::motion::TrackMotion;
-use crate::uncertainty::{CameraUncertainty, LASTING, OF_CLOCK, OF_POSE, SharedNoise, SharedTies};
+use crate::motion::MotionSetup;
+use crate::uncertainty::{
+    CameraUncertainty, CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies,
+};
 use crate::update::{Told, Updated};
 use crate::visibility::Visibility;
 
 /// Longest interval between bearings whose third difference is used, as a share of the holding time
-/// ([`TrackMotion::holding_s`], how long after a bearing its camera still supports the track): over
+/// ([`MotionSetup::holding_s`], how long after a bearing its camera still supports the track): over
 /// longer intervals noise cannot be told from jerk.
 const CLOSE_BEARINGS: f64 = 0.1;
 /// A draw (one comparison of the cameras' mean offsets from the target) lasts this long, s: long
@@ -82,7 +84,7 @@ pub(super) struct Drawn {
     /// Covariance of one bearing's noise, rad^2.
     noise: Matrix2<f64>,
     /// The part of the noise that lasts, and so is not averaged away.
-    lasting: SharedNoise,
+    lasting: CorrelatedNoise,
     pose: Matrix2<f64>,
     by_pose: Matrix2x6<f64>,
     clock: Vector2<f64>,
@@ -153,7 +155,7 @@ impl Ties {
         Self {
             covariance: SharedTies::zeros(),
             learnt: LearntTies::zeros(0),
-            lasting_s: SharedNoise::NONE.time_s,
+            lasting_s: CorrelatedNoise::NONE.time_s,
             visibility: Visibility::new(time),
             seen: None,
             period_s: 0.0,
@@ -165,7 +167,7 @@ impl Ties {
     }
 
     /// For a camera whose bearing is one of those that the track starts from.
-    pub(super) fn begun(time: Timestamp, covariance: SharedTies, lasting: SharedNoise) -> Self {
+    pub(super) fn begun(time: Timestamp, covariance: SharedTies, lasting: CorrelatedNoise) -> Self {
         let lasting_s = lasting.time_s;
         Self {
             covariance,
@@ -347,7 +349,7 @@ impl Track {
         &mut self,
         camera: &CameraName,
         line: &SightLine,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Option<f64> {
         let (now, state) = (self.updated, self.imm.combined());
         let (place, velocity) = (state.position(), state.velocity());
@@ -362,7 +364,7 @@ impl Track {
     /// mean over the models; returns the bearing's mean squared Mahalanobis distance.
     pub(super) fn carry(
         &mut self,
-        (camera, lasting): (&CameraName, SharedNoise),
+        (camera, lasting): (&CameraName, CorrelatedNoise),
         (time, interval): (Timestamp, f64),
         results: &[Option<Updated>],
     ) -> f64 {

@@ -5,7 +5,7 @@ use crossfix_message::{Timestamp, TrackEventKind, track_id};
 use super::{TrackChange, Tracker, mahalanobis_squared, same_target};
 use crate::cameras::Cameras;
 use crate::initiation::Start;
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::track::{Track, TrackId, TrackStatus};
 
 /// Size of the smallest target that is found, px: tracks closer together than this for every camera
@@ -197,7 +197,7 @@ fn is_one_image(old: &Track, new: &Track, time: Timestamp, cameras: &Cameras) ->
 
 /// Root of the summed variances of the predicted position, m: at least the standard deviation along
 /// any axis.
-fn position_sd(track: &Track, now: Timestamp, motion: &TrackMotion) -> f64 {
+fn position_sd(track: &Track, now: Timestamp, motion: &MotionSetup) -> f64 {
     let state = track.predicted(now, motion);
     state.covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()
 }

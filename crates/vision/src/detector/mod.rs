@@ -97,7 +97,7 @@ pub(crate) struct Findings {
 
 /// A known target that may turn out to be the scene.
 #[derive(Clone, Copy, Debug)]
-struct SceneWatch {
+struct SceneSuspect {
     id: ImageTrackId,
     /// Index of the scale that fits its size.
     level: usize,
@@ -118,7 +118,7 @@ pub(crate) struct Detector {
     age_s: f64,
     plots: Vec<Plot>,
     candidates: Candidates,
-    watches: Vec<SceneWatch>,
+    watches: Vec<SceneSuspect>,
 }
 
 impl Detector {
@@ -196,7 +196,7 @@ impl Detector {
                 Some(watch) => {
                     (watch.level, watch.place, watch.stands_out) = (level, place, stands_out);
                 }
-                None => self.watches.push(SceneWatch {
+                None => self.watches.push(SceneSuspect {
                     id: known.id,
                     level,
                     place,

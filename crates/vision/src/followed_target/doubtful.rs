@@ -3,7 +3,7 @@
 use super::Target;
 use crate::TrackerConfig;
 use crate::config::GateRule;
-use crate::frame::{NewImage, TargetStep};
+use crate::frame::{FrameInput, TargetStep};
 use crate::gate::Region;
 use crate::hypotheses::DOUBT;
 use crate::motion::ImageMotion;
@@ -19,7 +19,7 @@ impl Target {
     /// Forks the hypotheses if the camera may have turned: then everything in its image has moved,
     /// the target too. But light that changes may be taken for a turn, so the target may have
     /// stayed as well.
-    pub(super) fn may_move_with_scene(&mut self, frame: NewImage<'_>) {
+    pub(super) fn may_move_with_scene(&mut self, frame: FrameInput<'_>) {
         let by = frame.scene_moved;
         let is_followed = !self.state.is_searching() && !self.identity.is_on_probation();
         if is_followed
@@ -43,7 +43,7 @@ impl Target {
     /// `scratch.ratios`.
     pub(super) fn follow_hypotheses(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) -> TargetStep {
@@ -94,7 +94,7 @@ impl Target {
     fn settle_on(
         &mut self,
         (motion, posterior): (ImageMotion, Posterior),
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) -> TargetStep {

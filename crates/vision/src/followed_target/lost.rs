@@ -3,7 +3,7 @@
 use crossfix_filter::AxisMeasurement;
 
 use super::{MANOEUVRE, Target};
-use crate::frame::{NewImage, TargetStep};
+use crate::frame::{FrameInput, TargetStep};
 use crate::scratch::Scratch;
 use crate::search::Sought;
 
@@ -13,7 +13,7 @@ use crate::search::Sought;
 const CONTINUES_IMAGES: u32 = 20;
 
 impl Target {
-    pub(super) fn search(&mut self, frame: NewImage<'_>, scratch: &mut Scratch) -> TargetStep {
+    pub(super) fn search(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> TargetStep {
         self.state.forget_contrast(frame.interval);
         if !frame.may_search {
             self.state.missed += 1;
@@ -28,7 +28,7 @@ impl Target {
     /// Takes what a search finds, if it is accepted; else returns its score.
     fn find_again(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         scratch: &mut Scratch,
     ) -> Result<TargetStep, f64> {
         let Self { state, identity, search_memory: memory, .. } = self;
@@ -59,7 +59,7 @@ impl Target {
     /// search goes on from what was known before.
     pub(super) fn follow_on_probation(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         scratch: &mut Scratch,
     ) -> TargetStep {
         self.identity.predict_probation(frame);

@@ -15,7 +15,7 @@ use nalgebra::Matrix2;
 
 use crate::config::GateRule;
 use crate::fit::TargetFit;
-use crate::frame::{Measurement, NewImage, TargetStep};
+use crate::frame::{FrameInput, Measurement, TargetStep};
 use crate::gate::Region;
 use crate::hypotheses::PlaceHypotheses;
 use crate::identity::Identity;
@@ -23,7 +23,7 @@ use crate::motion::PlaceEvidence;
 use crate::posterior::{Posterior, PosteriorPart};
 use crate::scratch::Scratch;
 use crate::search_memory::SearchMemory;
-use crate::state::{BeliefState, SEEN};
+use crate::state::{SEEN, TargetBelief};
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Variance below which a fit is narrower than the map's pixels, px^2.
@@ -43,7 +43,7 @@ const SURE: f64 = 0.99;
 /// A target under track.
 #[derive(Clone, Debug)]
 pub(crate) struct Target {
-    pub(crate) state: BeliefState,
+    pub(crate) state: TargetBelief,
     pub(crate) identity: Identity,
     pub(crate) hypotheses: PlaceHypotheses,
     pub(crate) search_memory: SearchMemory,
@@ -77,7 +77,7 @@ impl Target {
         config: &TrackerConfig,
     ) -> Self {
         Self {
-            state: BeliefState::new(image, place, scratch, config),
+            state: TargetBelief::new(image, place, scratch, config),
             identity: Identity::new(),
             hypotheses: PlaceHypotheses::default(),
             search_memory: SearchMemory::default(),
@@ -102,7 +102,7 @@ impl Target {
     }
 
     /// Follows the target into the next image.
-    pub(crate) fn step(&mut self, frame: NewImage<'_>, scratch: &mut Scratch) -> TargetStep {
+    pub(crate) fn step(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> TargetStep {
         self.may_move_with_scene(frame);
         self.identity.note_last_place(&self.state, frame);
         self.state.predict(frame);
@@ -120,11 +120,11 @@ impl Target {
     /// the box it starts the motion from two measurements (Herasymenko 2021, eqs. 13-14).
     pub(crate) fn take_place(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         place: ImagePoint,
         scratch: &mut Scratch,
     ) -> TargetStep {
-        let NewImage { image, interval, config, .. } = frame;
+        let FrameInput { image, interval, config, .. } = frame;
         let variance = config.given_sd_px.powi(2);
         let searching = self.state.is_searching();
         let given = [place.x, place.y].map(|position| AxisMeasurement { position, variance });
@@ -153,8 +153,8 @@ impl Target {
         TargetStep { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
     }
 
-    fn follow(&mut self, frame: NewImage<'_>, scratch: &mut Scratch) -> TargetStep {
-        let NewImage { image, config, .. } = frame;
+    fn follow(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> TargetStep {
+        let FrameInput { image, config, .. } = frame;
         let reach = self.hypotheses.reach(self.state.position());
         let half = self.state.half_gate(image, config);
         let image_sides = [image.width(), image.height()];
@@ -192,7 +192,7 @@ impl Target {
     /// Takes the posterior into the filters and the target's image into the reference.
     fn update(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         posterior: &Posterior,
         fit: TargetFit,
         origin: [f64; 2],
@@ -290,7 +290,7 @@ impl Target {
     /// From one on probation nothing is learnt.
     fn learn(
         &mut self,
-        frame: NewImage<'_>,
+        frame: FrameInput<'_>,
         place: ImagePoint,
         fit: TargetFit,
         certainty: f64,

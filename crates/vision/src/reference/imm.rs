@@ -122,7 +122,7 @@ impl PixelImm {
     /// filters, the rest is left alone.
     pub fn step(&mut self, measured: &[f32], interval: f32, variance: f32, filtered: &mut [f32]) {
         let (models, stay) = (self.config.models(interval), self.config.stay);
-        Arch::new().dispatch(PixelStep {
+        Arch::new().dispatch(FilterStep {
             blocks: &mut self.blocks,
             models,
             stay,
@@ -133,7 +133,7 @@ impl PixelImm {
     }
 }
 
-struct PixelStep<'a> {
+struct FilterStep<'a> {
     blocks: &'a mut [EightPixels],
     models: [PixelModel; MODELS],
     stay: f32,
@@ -142,7 +142,7 @@ struct PixelStep<'a> {
     filtered: &'a mut [f32],
 }
 
-impl WithSimd for PixelStep<'_> {
+impl WithSimd for FilterStep<'_> {
     type Output = ();
 
     #[inline(always)]

@@ -69,7 +69,7 @@ impl Start {
 
 /// What the site plays, by the fusion centre's health.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum PlayedScene {
+enum ScenePlayback {
     /// The site's time runs and is `now`; if it plays a scene, the scene began at `scene_begins`.
     Plays { now: Timestamp, scene_begins: Timestamp },
     /// The site's time stands still, and all cameras are present.
@@ -78,16 +78,16 @@ enum PlayedScene {
     Waits,
 }
 
-fn judge(health: &Health, cameras: &[CameraName]) -> PlayedScene {
+fn judge(health: &Health, cameras: &[CameraName]) -> ScenePlayback {
     if health.is_playing {
-        return PlayedScene::Plays {
+        return ScenePlayback::Plays {
             now: Timestamp::from_nanos(health.time_ns),
             scene_begins: Timestamp::from_nanos(health.scene_begins_ns),
         };
     }
     let is_present =
         |camera: &CameraName| health.present.iter().any(|name| name == camera.as_str());
-    if cameras.iter().all(is_present) { PlayedScene::IsComplete } else { PlayedScene::Waits }
+    if cameras.iter().all(is_present) { ScenePlayback::IsComplete } else { ScenePlayback::Waits }
 }
 
 impl Agent {
@@ -171,11 +171,11 @@ impl Agent {
             let Ok(health) = decode::<Health>(&received.data) else { continue };
             let area = received.key.area;
             match judge(&health, &network.cameras_of(area.as_ref())?) {
-                PlayedScene::Plays { now, scene_begins } => {
+                ScenePlayback::Plays { now, scene_begins } => {
                     return Ok(Some(self.join(file, begins, now, scene_begins)));
                 }
-                PlayedScene::IsComplete => drop(complete.insert(area)),
-                PlayedScene::Waits => drop(complete.remove(&area)),
+                ScenePlayback::IsComplete => drop(complete.insert(area)),
+                ScenePlayback::Waits => drop(complete.remove(&area)),
             }
             if areas.iter().all(|area| complete.contains(area)) {
                 return Ok(Some(Start::together()));
@@ -223,10 +223,10 @@ mod tests {
             is_playing,
             ..Default::default()
         };
-        assert_eq!(judge(&health(false, &["a"]), &cameras), PlayedScene::Waits);
+        assert_eq!(judge(&health(false, &["a"]), &cameras), ScenePlayback::Waits);
         // A file may have been played to its end before.
-        assert_eq!(judge(&health(false, &["b", "a"]), &cameras), PlayedScene::IsComplete);
+        assert_eq!(judge(&health(false, &["b", "a"]), &cameras), ScenePlayback::IsComplete);
         let plays = judge(&health(true, &["b", "a"]), &cameras);
-        assert!(matches!(plays, PlayedScene::Plays { now, .. } if now == at));
+        assert!(matches!(plays, ScenePlayback::Plays { now, .. } if now == at));
     }
 }

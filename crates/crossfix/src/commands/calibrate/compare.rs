@@ -61,7 +61,7 @@ pub fn difference(first: &SiteCalibration, second: &SiteCalibration) -> Option<D
 pub struct Difference {
     /// Motion of the second site as a whole; absent with fewer than three cameras.
     moved: Option<MoveFigures>,
-    cameras: Vec<ComparedCamera>,
+    cameras: Vec<ComparisonFigures>,
     /// Cameras that only one of the two has.
     missing: Vec<String>,
 }
@@ -105,7 +105,7 @@ impl fmt::Display for MoveFigures {
 }
 
 #[derive(Debug, Serialize)]
-struct ComparedCamera {
+struct ComparisonFigures {
     name: String,
     centre_m: f64,
     /// Root mean square difference of directions over the image, per axis.
@@ -125,13 +125,13 @@ impl From<&SiteComparison> for Difference {
     fn from(comparison: &SiteComparison) -> Self {
         Self {
             moved: comparison.moved.as_ref().map(MoveFigures::from),
-            cameras: comparison.cameras.iter().map(ComparedCamera::from).collect(),
+            cameras: comparison.cameras.iter().map(ComparisonFigures::from).collect(),
             missing: comparison.missing.iter().map(ToString::to_string).collect(),
         }
     }
 }
 
-impl From<&CameraComparison> for ComparedCamera {
+impl From<&CameraComparison> for ComparisonFigures {
     fn from(camera: &CameraComparison) -> Self {
         Self {
             name: camera.name.to_string(),

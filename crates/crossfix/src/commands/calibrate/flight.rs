@@ -372,7 +372,7 @@ fn seen(
 }
 
 /// A recording's description of one camera.
-struct Described {
+struct RecordedCamera {
     lens: Intrinsics,
     /// Whether its times are common times: only a calibration by a flight states a clock's wander.
     is_corrected: bool,
@@ -380,7 +380,7 @@ struct Described {
     is_on_mount: bool,
 }
 
-impl Described {
+impl RecordedCamera {
     /// Checks that an earlier calibration has the same image size, and that it is the one that the
     /// bearings were made with, if they were made with any.
     fn check_against(&self, known: Option<&CalibratedCamera>) -> anyhow::Result<()> {
@@ -402,8 +402,8 @@ impl Described {
 }
 
 /// Descriptions of a recording's cameras, by the first calibration message of each.
-fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, Described>> {
-    let mut cameras: BTreeMap<CameraName, Described> = BTreeMap::new();
+fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, RecordedCamera>> {
+    let mut cameras: BTreeMap<CameraName, RecordedCamera> = BTreeMap::new();
     recorded::for_each(recording, &mut Lacks::default(), |lacks, entry| {
         if let Channel::Calibration(name) = &entry.key.channel
             && !cameras.contains_key(name)
@@ -411,7 +411,7 @@ fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, Described>
         {
             let is_corrected = message.corrects_clock();
             let (lens, is_on_mount) = (message.lens(name)?, message.mount.is_some());
-            cameras.insert(name.clone(), Described { lens, is_corrected, is_on_mount });
+            cameras.insert(name.clone(), RecordedCamera { lens, is_corrected, is_on_mount });
         }
         Ok(())
     })?;

@@ -95,7 +95,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for error in &failed {
         tracing::warn!("{error}");
     }
-    let figures: Vec<PosedCamera> = results.iter().map(PosedCamera::from).collect();
+    let figures: Vec<PoseFigures> = results.iter().map(PoseFigures::from).collect();
     if args.json {
         output::json(&figures)?;
     } else {
@@ -160,7 +160,7 @@ fn write(args: &Args, cameras: &[&LandmarkResult]) -> anyhow::Result<()> {
 
 /// The figures of one camera.
 #[derive(Debug, Serialize)]
-struct PosedCamera {
+struct PoseFigures {
     name: String,
     position_m: [f64; 3],
     position_sd_m: f64,
@@ -173,12 +173,12 @@ struct PosedCamera {
     focal_ratio: f64,
     /// Probability of errors at least as large as these.
     chance: f64,
-    landmarks: Vec<ClickedLandmark>,
+    landmarks: Vec<LandmarkResidual>,
     verdict: String,
 }
 
 #[derive(Debug, Serialize)]
-struct ClickedLandmark {
+struct LandmarkResidual {
     landmark: String,
     /// Clicked pixel minus predicted pixel.
     residual_px: [f64; 2],
@@ -242,10 +242,10 @@ fn verdict(result: &LandmarkResult) -> String {
     "good".to_owned()
 }
 
-impl From<&LandmarkResult> for PosedCamera {
+impl From<&LandmarkResult> for PoseFigures {
     fn from(result: &LandmarkResult) -> Self {
         let over_image = result.over_image();
-        let landmarks = result.landmarks.iter().map(|fit| ClickedLandmark {
+        let landmarks = result.landmarks.iter().map(|fit| LandmarkResidual {
             landmark: fit.name.clone(),
             residual_px: fit.residual_px.into(),
             deviations: fit.deviations,
@@ -265,7 +265,7 @@ impl From<&LandmarkResult> for PosedCamera {
     }
 }
 
-impl PosedCamera {
+impl PoseFigures {
     fn render(&self) -> String {
         let mut rows = vec![["landmark", "beside [px]", "deviations"].map(str::to_owned).to_vec()];
         for landmark in &self.landmarks {

@@ -39,7 +39,7 @@ struct HeardHealth {
 
 /// State of one component of a site.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct ComponentState {
+pub struct ComponentRow {
     /// The camera's name, `fusion` (`fusion-west` of an area) or `recorder`.
     pub name: String,
     /// The component's state in a word or two.
@@ -70,7 +70,7 @@ pub struct ComponentState {
 pub struct Status {
     pub site: String,
     /// The cameras of the network's file, the fusion centre, and the recorder if it is heard.
-    pub parts: Vec<ComponentState>,
+    pub parts: Vec<ComponentRow>,
     /// Number of tracks that are confirmed or coasting.
     pub confirmed: usize,
     /// Number of tracks that only one camera follows.
@@ -161,7 +161,7 @@ impl Board {
         }
     }
 
-    fn part(&self, name: &str, clock: Option<&CameraHealth>, now: Instant) -> ComponentState {
+    fn part(&self, name: &str, clock: Option<&CameraHealth>, now: Instant) -> ComponentRow {
         let nobody = Health::default();
         let heard = self.parts.get(name);
         // For a camera that is not heard, earlier clock estimates say nothing.
@@ -169,7 +169,7 @@ impl Board {
         let health = heard.map_or(&nobody, |heard| &heard.health);
         let load = health.load.as_ref();
         let p99_us = health.counters.iter().find(|one| one.name == "arrival_to_bearings_p99_us");
-        ComponentState {
+        ComponentRow {
             name: name.to_owned(),
             state: state(heard, clock, now),
             rate_hz: health.rate_hz,
@@ -220,7 +220,7 @@ impl Status {
             "C",
         ];
         let mut rows = vec![head.map(str::to_owned).to_vec()];
-        rows.extend(self.parts.iter().map(ComponentState::row));
+        rows.extend(self.parts.iter().map(ComponentRow::row));
         let mut lines = vec![format!("site `{}`", self.site), output::table(&rows)];
         let [confirmed, one_camera] = [self.confirmed, self.one_camera];
         lines.push(format!(
@@ -233,7 +233,7 @@ impl Status {
     }
 }
 
-impl ComponentState {
+impl ComponentRow {
     fn row(&self) -> Vec<String> {
         let number = |value: Option<f64>, digits: usize| {
             value.map_or(String::new(), |value| format!("{value:.digits$}"))

@@ -35,14 +35,14 @@ const VELOCITY_SCALE: f64 = 100.0;
 
 /// What the paper's noise is added to.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum NoiseReading {
+enum NoiseInterpretation {
     /// To the coordinates of M(i, j), after the solution.
     Positions,
     /// To all bearings.
     Bearings,
 }
 
-impl NoiseReading {
+impl NoiseInterpretation {
     /// The temporal gate, m.
     fn gate(self) -> f64 {
         match self {
@@ -98,7 +98,7 @@ const CELLS: [TableColumn; 8] = [
 ];
 
 /// Result of one run: the distance of each target from its own group, if there is one.
-struct RunResult {
+struct DetectionRun {
     distances: Vec<f64>,
     all: bool,
     /// Whether the estimated number of targets is right.
@@ -174,10 +174,10 @@ fn period_fix(
 
 fn run(
     cell: &TableColumn,
-    reading: NoiseReading,
+    reading: NoiseInterpretation,
     cameras: &[(CameraName, Camera)],
     noise: &mut Noise,
-) -> RunResult {
+) -> DetectionRun {
     let targets: Vec<StraightTarget> =
         (0..cell.targets).map(|_| StraightTarget::random(noise)).collect();
     let mut grouping = Grouping::new(GroupingRules {
@@ -192,8 +192,9 @@ fn run(
         let seen = cameras.iter().zip(cell.delays).map(|((name, camera), delay)| {
             let time = period as f64 + delay;
             let lines = targets.iter().enumerate().filter_map(|(index, target)| {
-                let offset =
-                    tangent_noise((reading == NoiseReading::Bearings).then_some(&mut *noise));
+                let offset = tangent_noise(
+                    (reading == NoiseInterpretation::Bearings).then_some(&mut *noise),
+                );
                 let id = (name.clone(), period as u64, index);
                 Some((id, line(camera, target.at(time), offset, time)?))
             });
@@ -201,7 +202,7 @@ fn run(
         });
         let lines: Vec<Vec<(LineId, TimedLine)>> = seen.collect();
         let mut fixes = fixes(&lines);
-        if reading == NoiseReading::Positions {
+        if reading == NoiseInterpretation::Positions {
             for fix in &mut fixes {
                 for axis in 0..3 {
                     fix.fix.state.mean[axis] += POSITION_SD * noise.normal();
@@ -216,7 +217,7 @@ fn run(
     let places: Vec<Point3<f64>> = targets.iter().map(|target| target.at(time)).collect();
     let distances = matched(&places, &ends);
     let near = distances.iter().filter(|&&distance| distance <= MATCH_GATE).count();
-    RunResult {
+    DetectionRun {
         all: near == targets.len(),
         counted: grouping.target_count() == targets.len(),
         distances,
@@ -248,7 +249,7 @@ fn matched(places: &[Point3<f64>], ends: &[Point3<f64>]) -> Vec<f64> {
 fn figures(
     options: ValidationOptions,
     cell: &TableColumn,
-    reading: NoiseReading,
+    reading: NoiseInterpretation,
 ) -> [((f64, f64), usize); 4] {
     let layout = PaperSite::orthogonal("", cell.delays);
     let cameras = layout.cameras().unwrap_or_default();
@@ -272,7 +273,7 @@ fn figures(
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let mut rows: [Vec<TableRow>; 4] = Default::default();
     for cell in &CELLS {
-        for reading in [NoiseReading::Positions, NoiseReading::Bearings] {
+        for reading in [NoiseInterpretation::Positions, NoiseInterpretation::Bearings] {
             let receivers = if cell.receivers == 2 { "two" } else { "three" };
             let series = format!("{receivers} receivers, m = {}, {}", cell.targets, reading.name());
             let reference = cell.reference[reading as usize];

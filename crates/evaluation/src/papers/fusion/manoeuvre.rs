@@ -93,7 +93,7 @@ enum FilterChoice {
 }
 
 /// Result of a method on a flight.
-struct FilterErrors {
+struct FilterResult {
     /// Squared errors per axis, m^2, means over the judged frames.
     squares: [f64; 3],
     /// Frames with alarms.
@@ -101,7 +101,7 @@ struct FilterErrors {
 }
 
 impl FilterChoice {
-    fn follow(&self, flight: &TurningFlight, deviation: f64) -> FilterErrors {
+    fn follow(&self, flight: &TurningFlight, deviation: f64) -> FilterResult {
         let (places, alarms) = match self {
             Self::Measurement => (flight.measured.clone(), Vec::new()),
             Self::Imm(models) => {
@@ -127,7 +127,7 @@ impl FilterChoice {
                 *square += (found[axis] - truth[axis]).powi(2) / count;
             }
         }
-        FilterErrors { squares, alarms }
+        FilterResult { squares, alarms }
     }
 
     fn name(&self) -> String {

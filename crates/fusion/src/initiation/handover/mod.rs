@@ -22,7 +22,7 @@ use super::one_target::OneTargetTest;
 use super::{Start, lines_with_pose};
 use crate::cameras::{KnownCamera, Rooted};
 use crate::cueing::CueTarget;
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::spatial::TimedLine;
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::same_target;
@@ -55,7 +55,7 @@ pub(super) struct Handover {
 /// A line (by its index) that continues a direction which the camera follows, with that direction's
 /// number and the time of its first line.
 #[derive(Clone, Copy, Debug)]
-struct Continued {
+struct ContinuedLine {
     index: usize,
     number: u64,
     first: Timestamp,
@@ -102,7 +102,7 @@ impl Handover {
         exposure: &Exposure,
         used: &[(usize, TrackId)],
         known: &KnownCamera,
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Vec<Start> {
         let mut is_owned = vec![false; exposure.sightings.len()];
         used.iter().for_each(|(index, _)| is_owned[*index] = true);
@@ -139,7 +139,7 @@ impl Handover {
 
     /// Continues the directions that the exposure's camera follows; returns the lines that continue
     /// them.
-    fn follow(&mut self, context: &ReadingContext<'_>) -> Vec<Continued> {
+    fn follow(&mut self, context: &ReadingContext<'_>) -> Vec<ContinuedLine> {
         let ReadingContext { exposure, known, is_owned, .. } = *context;
         let factor = exposure.uncertainty.factor;
         let clutter = self.rules.clutter_per_sr(known).ln();
@@ -184,7 +184,7 @@ impl Handover {
             one.pose_variance = pose_variance(&with_pose[index], exposure, index);
             one.line = with_pose[index].clone();
             one.image_track = exposure.sightings[index].image_track;
-            begun.push(Continued { index, number: one.number, first: one.first });
+            begun.push(ContinuedLine { index, number: one.number, first: one.first });
         }
         let mut place = 0..;
         seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
@@ -206,7 +206,7 @@ impl Handover {
 
     /// Starts readings: combines what other cameras have lost sight of with what this camera has
     /// begun to see since.
-    fn cross(&mut self, context: &ReadingContext<'_>, begun: &[Continued]) {
+    fn cross(&mut self, context: &ReadingContext<'_>, begun: &[ContinuedLine]) {
         let ReadingContext { exposure, known, motion, is_owned } = *context;
         let now = exposure.time;
         let others = self.seen.iter_mut().filter(|(camera, _)| **camera != exposure.camera);
@@ -223,7 +223,8 @@ impl Handover {
         for (camera, one) in lost.into_iter().take(MAX_LOST) {
             let since =
                 begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
-            for &Continued { index, number, .. } in since.filter(|other| !is_owned[other.index]) {
+            for &ContinuedLine { index, number, .. } in since.filter(|other| !is_owned[other.index])
+            {
                 let name = (exposure.camera.clone(), exposure.sequence, index);
                 let is_read = one.readings.iter().any(|reading| reading.newest == name);
                 let is_full = one.readings.len() >= MAX_READINGS || one.tried.len() >= MAX_TRIED;

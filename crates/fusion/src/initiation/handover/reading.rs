@@ -6,7 +6,7 @@ use crossfix_message::CameraName;
 use super::super::MAX_LINES;
 use super::super::one_target::OneTargetTest;
 use crate::cameras::{KnownCamera, view_sr};
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::spatial::LineId;
 use crate::track::{Track, TrackExpectation};
 use crate::uncertainty::CameraUncertainty;
@@ -51,7 +51,7 @@ impl Rules {
 pub(super) struct ReadingContext<'a> {
     pub(super) exposure: &'a Exposure,
     pub(super) known: &'a KnownCamera,
-    pub(super) motion: &'a TrackMotion,
+    pub(super) motion: &'a MotionSetup,
     /// Whether a line belongs to a track, by index.
     pub(super) is_owned: &'a [bool],
 }

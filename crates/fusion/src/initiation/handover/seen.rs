@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Vector3, Vector6};
 
 use super::super::sight::DirectionFilter;
 use super::reading::Reading;
-use crate::motion::TrackMotion;
+use crate::motion::MotionSetup;
 use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
 use crate::track::Track;
 use crate::uncertainty::CameraUncertainty;
@@ -109,7 +109,7 @@ impl SeenDirection {
         camera: &CameraName,
         (line, time): (&SightLine, Timestamp),
         (speed, max_range_m): (f64, f64),
-        motion: &TrackMotion,
+        motion: &MotionSetup,
     ) -> Option<Track> {
         let Self { sight, line: last, uncertainty, .. } = self;
         let by_now = self.at(time).direction;

@@ -41,7 +41,7 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Vec<LogRow>> {
         tracing::warn!("{}: {damaged} sentences are damaged", path.display());
     }
     ensure!(!places.is_empty(), "it has no place that the receiver was sure of (GGA)");
-    places.into_iter().map(UndatedPosition::row).collect()
+    places.into_iter().map(NmeaPosition::row).collect()
 }
 
 /// The fields of a sentence, beginning with its talker and kind.
@@ -89,11 +89,11 @@ impl<'a> Sentence<'a> {
 
     /// A GGA's position. Its fields: time, latitude, longitude, quality, satellites, dilution,
     /// height above the sea, its unit, and height of the sea above the ellipsoid.
-    fn place(&self) -> Option<UndatedPosition> {
+    fn place(&self) -> Option<NmeaPosition> {
         /// Qualities of a real fix: not dead reckoning, manual input or simulation.
         const SURE: [f64; 5] = [1.0, 2.0, 3.0, 4.0, 5.0];
         SURE.contains(&self.number(6)?).then_some(())?;
-        Some(UndatedPosition {
+        Some(NmeaPosition {
             of_day_s: self.of_day_s(1)?,
             time_s: None,
             place: [self.degrees(2, ["N", "S"])?, self.degrees(4, ["E", "W"])?, self.number(9)?],
@@ -115,7 +115,7 @@ impl<'a> Sentence<'a> {
 
 /// A position whose day may not be known yet.
 #[derive(Clone, Copy, Debug)]
-struct UndatedPosition {
+struct NmeaPosition {
     of_day_s: f64,
     time_s: Option<f64>,
     /// Latitude and longitude, degrees, and height above the sea, m.
@@ -123,7 +123,7 @@ struct UndatedPosition {
     geoid_m: Option<f64>,
 }
 
-impl UndatedPosition {
+impl NmeaPosition {
     fn row(self) -> anyhow::Result<LogRow> {
         let time_s = self.time_s.context(
             "it has no date: let the receiver send RMC sentences as well, or make columns of it",
@@ -135,7 +135,7 @@ impl UndatedPosition {
 }
 
 /// Gives the newest positions that have no day yet the day that brings them nearest to a moment.
-fn place_in_day(places: &mut [UndatedPosition], moment_s: f64) {
+fn place_in_day(places: &mut [NmeaPosition], moment_s: f64) {
     for found in places.iter_mut().rev().take_while(|found| found.time_s.is_none()) {
         let days = ((moment_s - found.of_day_s) / DAY_S).round();
         found.time_s = Some(found.of_day_s + days * DAY_S);
