@@ -80,10 +80,8 @@ kill $camera",
         off.sort_unstable_by(f64::total_cmp);
         let at = |share: f64| off[(share * (off.len() - 1) as f64) as usize];
         println!("{:.2} {:.2} {:.2} px", at(0.05), at(0.5), at(0.95));
-        // The dot is drawn at whole pixels: up to half a pixel beside its place in the image from which
-        // the template was taken, which moves all places alike, and again in each image, which
-        // spreads them by half a pixel.
-        assert!(at(0.5).abs() < 0.5, "{off:?}");
-        assert!(at(0.5) - at(0.05) < 0.6 && at(0.95) - at(0.5) < 0.6, "{off:?}");
+        // The template of an agent that leaves out frames holds the target a quarter of a pixel beside
+        // its middle: this test has the machine for itself (.config/nextest.toml).
+        assert!(at(0.5).abs() < 0.2 && at(0.05) > -0.8 && at(0.95) < 0.8, "{off:?}");
     }
 }
