@@ -90,14 +90,22 @@ struct Outcome {
     by: [usize; 2],
     /// Where more than one number was said.
     twice: usize,
-    /// Squares of how far off it was, a metre at most: who is wrong is wrong.
-    squares: f64,
+    /// By the instant, the square of how far off it was, a metre at most: who is wrong is wrong.
+    squares: BTreeMap<usize, f64>,
 }
 
 impl Outcome {
     /// The share that the commonest number has.
     fn commonest(&self) -> f64 {
         *self.numbers.values().max().unwrap() as f64 / self.said as f64
+    }
+
+    /// Mean square at the instants at which others said something too.
+    fn mean_square_with(&self, others: [&Self; 2]) -> f64 {
+        let told = |instant: &usize| others.iter().all(|other| other.squares.contains_key(instant));
+        let squares: Vec<f64> =
+            self.squares.iter().filter(|(instant, _)| told(instant)).map(|(_, s)| *s).collect();
+        squares.iter().sum::<f64>() / squares.len() as f64
     }
 }
 
@@ -133,7 +141,7 @@ fn divided(
             outcome.said += 1;
             outcome.by[who] += 1;
             *outcome.numbers.entry(id).or_default() += 1;
-            outcome.squares += (nearest - place).norm().min(1.0).powi(2);
+            outcome.squares.insert(next, (nearest - place).norm().min(1.0).powi(2));
         }
     }
     outcome
@@ -186,9 +194,11 @@ fn a_real_drone_is_one_target_however_its_cameras_are_divided() {
     for areas in ways().into_iter().step_by(6) {
         let [west, east] = [&areas[0], &areas[1]].map(|area| run([area, &[]]));
         let both = run([&areas[0], &areas[1]]);
+        // Where one alone says nothing is where the other has little to say: at the same instants.
+        let mean = |outcome: &Outcome| outcome.mean_square_with([&west, &east]);
         println!(
             "{areas:?}: said {} times ({} and {} alone), one number {:.3} ({:.3} and {:.3}), two at once {}, \
-             squares {:.0} ({:.0} and {:.0} m^2)",
+             mean square {:.3} ({:.3} and {:.3} m^2)",
             both.said,
             west.said,
             east.said,
@@ -196,15 +206,14 @@ fn a_real_drone_is_one_target_however_its_cameras_are_divided() {
             west.commonest(),
             east.commonest(),
             both.twice,
-            both.squares,
-            west.squares,
-            east.squares
+            mean(&both),
+            mean(&west),
+            mean(&east)
         );
         assert!(both.said > west.said.max(east.said), "who sees it says it");
         assert!(both.commonest() > 0.97, "{:?}", both.numbers);
         assert!(both.by.iter().all(|said| *said > both.said / 20), "both say it: {:?}", both.by);
         assert!(both.twice < both.said / 30, "{}", both.twice);
-        let mean = |outcome: &Outcome| outcome.squares / outcome.said as f64;
         assert!(mean(&both) < mean(&west).max(mean(&east)), "no worse than the worse of the two");
     }
 }

@@ -242,6 +242,7 @@ impl CameraSource<'_> {
         let model = CameraModel::new(intrinsics).with_context(|| format!("camera `{name}`"))?;
         let height = f64::from(self.lens.resolution[1]);
         let bearings = Key::new(self.site.clone(), Channel::Bearings(name.clone()));
+        let clock_sd_s = if self.is_raw { 0.0 } else { self.clock_sd_s(labels, &model) };
         let mut entries = Vec::new();
         let mut without_direction = 0_u64;
         for label in labels {
@@ -264,6 +265,7 @@ impl CameraSource<'_> {
                 sequence: label.frame,
                 capture_time_ns: time.nanos(),
                 clock_source: ClockSource::FrameCount.into(),
+                capture_time_sd_s: clock_sd_s,
                 tracks: track.into_iter().collect(),
                 ..Default::default()
             };
@@ -280,6 +282,22 @@ impl CameraSource<'_> {
         let key = Key::new(self.site.clone(), Channel::Calibration(name));
         entries.insert(0, imported(key, Timestamp::EPOCH, calibration.encode()));
         Ok(entries)
+    }
+
+    /// Standard deviation of the camera's times, s: the time in which the drone moves by as much as
+    /// the fit's residual. What is left there may be the clock's error as well as the pose's: frames
+    /// are counted, and phones lose some. 6 to 43 ms for these cameras.
+    fn clock_sd_s(&self, labels: &[ImportedLabel], model: &CameraModel) -> f64 {
+        let direction = |label: &ImportedLabel| model.direction(label.pixel?).ok();
+        let squared_rates: Vec<f64> = labels
+            .windows(2)
+            .filter(|pair| pair[1].frame == pair[0].frame + 1)
+            .filter_map(|pair| Some(direction(&pair[0])?.angle(&*direction(&pair[1])?)))
+            .map(|angle| (angle * self.lens.fps).powi(2))
+            .collect();
+        let mean_square = squared_rates.iter().sum::<f64>() / squared_rates.len().max(1) as f64;
+        // A drone that does not move says nothing of a clock, and needs none.
+        if mean_square > 0.0 { self.fitted.residual_sigma_rad / mean_square.sqrt() } else { 0.0 }
     }
 
     fn label_sd_rad(&self) -> f64 {
@@ -394,17 +412,20 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn a_label_where_the_lens_has_no_direction_is_left_out_and_the_others_are_not() {
-        // A barrel so strong that the polynomial turns back within the image.
-        let lens: LensFile = serde_json::from_value(json!({
+    /// A lens of 500 px at 30 Hz, with this distortion of the third order.
+    fn lens(distortion: f64) -> LensFile {
+        serde_json::from_value(json!({
             "K-matrix": [[500.0, 0.0, 960.0], [0.0, 500.0, 540.0], [0.0, 0.0, 1.0]],
-            "distCoeff": [-0.3, 0.0, 0.0, 0.0],
+            "distCoeff": [distortion, 0.0, 0.0, 0.0],
             "fps": 30.0,
             "resolution": [1920, 1080],
         }))
-        .unwrap();
-        let fitted: FittedCamera = serde_json::from_value(json!({
+        .unwrap()
+    }
+
+    /// A camera that was fitted to a milliradian.
+    fn fitted() -> FittedCamera {
+        serde_json::from_value(json!({
             "name": "wide",
             "R_world_to_cam": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             "centre_enu_m": [0.0, 0.0, 0.0],
@@ -413,7 +434,27 @@ mod tests {
             "readout_fraction_of_frame": 0.0,
             "residual_sigma_rad": 0.001,
         }))
-        .unwrap();
+        .unwrap()
+    }
+
+    #[test]
+    fn a_clock_is_as_unsure_as_the_residual_leaves_it() {
+        let (lens, fitted, site) = (lens(0.0), fitted(), "test".parse().unwrap());
+        let source = CameraSource { site: &site, fitted: &fitted, lens: &lens, is_raw: false };
+        // 2 of 500 px a frame are 120 mrad/s; the gap between frames 1 and 8 is no step of one frame.
+        let label = |frame, x| ImportedLabel { frame, pixel: Some(Pixel::new(x, 540.0)) };
+        let labels = [label(0, 960.0), label(1, 962.0), label(8, 1200.0)];
+        let entries = source.entries(&labels, |_| true).unwrap();
+        let frame = decode::<BearingFrame>(&entries[1].data).unwrap();
+        assert!((frame.capture_time_sd_s - 0.001 / 0.12).abs() < 1e-6, "{frame:?}");
+        let still = source.entries(&labels[..1], |_| true).unwrap();
+        assert_eq!(decode::<BearingFrame>(&still[1].data).unwrap().capture_time_sd_s, 0.0);
+    }
+
+    #[test]
+    fn a_label_where_the_lens_has_no_direction_is_left_out_and_the_others_are_not() {
+        // A barrel so strong that the polynomial turns back within the image.
+        let (lens, fitted) = (lens(-0.3), fitted());
         let label = |frame, x, y| ImportedLabel { frame, pixel: Some(Pixel::new(x, y)) };
         let labels = [label(0, 960.0, 540.0), label(1, 3.0, 3.0), label(2, 1000.0, 500.0)];
         let site = "test".parse().unwrap();

@@ -3,6 +3,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
+use super::batch_means::BatchMeans;
 use super::curve::{Basis, Curve};
 use super::window::WindowBearing;
 
@@ -100,6 +101,9 @@ pub(super) struct AdjustedCameras {
     pub(super) covariance: DMatrix<f64>,
     /// Factor on each camera's reported covariances: 1 where these agree with its residuals.
     pub(super) scales: Vec<f64>,
+    /// Factor by which the information of the bearings on clocks and poses is overstated, as their
+    /// residuals are not independent: the mean over the bearings, at least 1.
+    pub(super) inflation: f64,
     /// Share of each camera's bearings that do not fit.
     pub(super) outlier_shares: Vec<f64>,
     /// Squared Mahalanobis distance of clocks and poses from their prior.
@@ -136,6 +140,7 @@ impl<'a> Adjustment<'a> {
         if self.rescale(&state, Loss::Trimmed) {
             (state, density, evidence) = self.best_density(state, density)?;
         }
+        let inflation = self.inflation(&state);
         let outlier_shares =
             self.squares(&state).iter().map(|squares| outlier_share(squares)).collect();
         let (covariance, pulled) = self.posterior(&state, density)?;
@@ -143,6 +148,7 @@ impl<'a> Adjustment<'a> {
             cameras: state.cameras,
             covariance,
             scales: self.scales,
+            inflation,
             outlier_shares,
             pulled,
             evidence,
@@ -174,6 +180,21 @@ impl<'a> Adjustment<'a> {
             *scale = next.min(MAX_SCALE);
         }
         changed
+    }
+
+    /// Factor by which the information of all bearings is overstated.
+    fn inflation(&self, state: &WindowState) -> f64 {
+        let mut means = vec![BatchMeans::default(); self.scales.len()];
+        for sight in self.sights {
+            let place = self.target(sight, state).place;
+            let residual = whitened(sight, place, self.scales[sight.camera]);
+            if let Some(residual) = residual.filter(|z| z.norm_squared() <= OUTLIER) {
+                means[sight.camera].add(sight.time_s, residual);
+            }
+        }
+        let inflations: Vec<f64> = means.iter().map(BatchMeans::inflation).collect();
+        let of_sights = self.sights.iter().map(|sight| inflations[sight.camera]);
+        of_sights.sum::<f64>() / self.sights.len().max(1) as f64
     }
 
     /// Squared Mahalanobis distances of each camera's bearings.
@@ -378,6 +399,14 @@ impl<'a> Adjustment<'a> {
 fn outlier_share(squares: &[f64]) -> f64 {
     squares.iter().filter(|squared| **squared > OUTLIER).count() as f64
         / squares.len().max(1) as f64
+}
+
+/// Residual of a bearing with the target at a place, in units of its noise; `None` if the place lies
+/// behind the camera.
+fn whitened(sight: &WindowBearing, target: Vector3<f64>, scale: f64) -> Option<Vector2<f64>> {
+    let residual = sight.line.tangent_offset(target.into())?;
+    // z <- L^-1 z, where R = L L'.
+    (sight.line.covariance * scale).cholesky()?.l().solve_lower_triangular(&residual)
 }
 
 /// Density of the jerk, m^2/s^5.

@@ -7,7 +7,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, DVector, Matrix6};
 
 use super::ClockEstimate;
-use super::common_time::{ClockReading, Common, common_time};
+use super::common_time::{ClockReading, Common, LIARS_SD_S, common_time};
 
 /// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
 const OFFSET_WALK: f64 = 1e-12;
@@ -17,6 +17,9 @@ const OFFSET_FLOOR_S: f64 = 1e-6;
 const DRIFT_FLOOR: f64 = 1e-9;
 /// The same floor for a pose, rad and m.
 const POSE_FLOOR: f64 = 1e-6;
+/// Weight of a window in the mean of the latest ones' inflations. With half of it a minute passes
+/// before a change in the bearings' errors shows.
+const INFLATION_WEIGHT: f64 = 0.25;
 /// Offsets are clamped to this, s: beyond it they are no offsets any more.
 const MAX_OFFSET_S: f64 = 2.0;
 
@@ -42,6 +45,9 @@ struct ClockEntry {
     drift_prior: f64,
     /// Random walk of its offset beside [`OFFSET_WALK`], s^2/s.
     walk: f64,
+    /// Factor by which the information of the bearings on it is overstated, the mean of the latest
+    /// windows; `None` before any.
+    inflation: Option<f64>,
 }
 
 /// Offsets and drifts of all clocks relative to the first, and the pose errors (world axes:
@@ -93,8 +99,10 @@ impl Belief {
                 self.covariance[(place + i, place + i)] = common + own[i];
             }
         }
-        self.cameras
-            .insert(camera.clone(), ClockEntry { place, pose: None, prior, drift_prior, walk });
+        self.cameras.insert(
+            camera.clone(),
+            ClockEntry { place, pose: None, prior, drift_prior, walk, inflation: None },
+        );
         self.settle();
         self.calibrate(camera, pose);
     }
@@ -244,6 +252,18 @@ impl Belief {
         }
     }
 
+    /// Takes in the factor by which a window's information on the clocks of some cameras is
+    /// overstated. The belief is updated as if the bearings were independent, which weighs the
+    /// windows as well as any common factor does; what is stated of it allows for the factor.
+    pub(super) fn see_inflation(&mut self, cameras: &[CameraName], inflation: f64) {
+        for camera in cameras {
+            if let Some(clock) = self.cameras.get_mut(camera) {
+                let mean = clock.inflation.get_or_insert(inflation);
+                *mean += INFLATION_WEIGHT * (inflation - *mean);
+            }
+        }
+    }
+
     /// Handles a report that a clock is worse than it was: standard deviations of offset (s) and
     /// drift (s/s). The mean stays, and may be off by that much.
     pub(super) fn reopen(&mut self, camera: &CameraName, deviations: [f64; 2]) {
@@ -295,8 +315,20 @@ impl Belief {
         stood
     }
 
+    /// Forgets all that was learnt of a clock that may have jumped: it is no better known than a
+    /// clock that is not as good as reported.
+    pub(super) fn doubt_jumped(&mut self, camera: &CameraName) {
+        self.doubt_beside(camera, LIARS_SD_S.powi(2));
+    }
+
     /// Forgets all that was learnt of a clock: only its reported deviations remain.
     pub(super) fn doubt(&mut self, camera: &CameraName) {
+        self.doubt_beside(camera, 0.0);
+    }
+
+    /// Forgets all that was learnt of a clock, whose offset may have changed by as much as a
+    /// variance says, s^2, beside what was reported.
+    fn doubt_beside(&mut self, camera: &CameraName, jumped: f64) {
         let (Some(clock), Some(reference)) = (self.cameras.get(camera).copied(), self.reference())
         else {
             return;
@@ -305,7 +337,7 @@ impl Belief {
             // The reference: all other offsets are relative to it, so they share its deviation from
             // true time.
             let others: Vec<usize> = self.clock_places().collect();
-            for (i, variance) in [clock.prior, clock.drift_prior].into_iter().enumerate() {
+            for (i, variance) in [clock.prior + jumped, clock.drift_prior].into_iter().enumerate() {
                 for (&k, &l) in others.iter().flat_map(|k| others.iter().map(move |l| (k, l))) {
                     self.covariance[(k + i, l + i)] += variance;
                 }
@@ -316,7 +348,7 @@ impl Belief {
         // off from true time as well, it has both variances.
         let common = self.reference_offset_and_drift();
         let variances = [
-            clock.prior + reference.prior + OFFSET_FLOOR_S.powi(2),
+            clock.prior + jumped + reference.prior + OFFSET_FLOOR_S.powi(2),
             clock.drift_prior + reference.drift_prior + DRIFT_FLOOR.powi(2),
         ];
         for (i, variance) in variances.into_iter().enumerate() {
@@ -412,6 +444,7 @@ impl Belief {
         let clock = self.cameras.get(camera)?;
         let ahead = self.ahead(time);
         let (offset, own, common) = self.absolute(clock, 0, ahead);
+        let own = inflated(own, clock.prior + common, clock.inflation.unwrap_or(1.0));
         let (drift, own_drift, common_drift) = self.absolute(clock, 1, ahead);
         Some(ClockEstimate {
             offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
@@ -446,6 +479,16 @@ impl Belief {
             self.site[i] - common.sum::<f64>()
         })
     }
+}
+
+/// Variance of an estimate whose information beyond its prior is overstated by a factor.
+fn inflated(variance: f64, prior: f64, inflation: f64) -> f64 {
+    if variance <= 0.0 || variance >= prior {
+        return variance;
+    }
+    // 1 / variance = 1 / prior + information
+    let information = variance.recip() - prior.recip();
+    (prior.recip() + information / inflation).recip()
 }
 
 #[cfg(test)]

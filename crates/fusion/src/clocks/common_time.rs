@@ -13,7 +13,7 @@ use std::f64::consts::PI;
 /// deviations, and not by 5.5.
 const LIARS: f64 = 0.01;
 /// Standard deviation of their offsets, s. With half of it the same.
-const LIARS_SD_S: f64 = 1.0;
+pub(super) const LIARS_SD_S: f64 = 1.0;
 /// Iterations towards a maximum: they settle in three or four.
 const STEPS: usize = 10;
 /// Maxima closer to each other than this many standard deviations count as one.

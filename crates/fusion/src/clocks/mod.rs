@@ -8,6 +8,7 @@
 //! problem, and in straight passes at 30 m/s it was sure of a wrong answer in three of eight.
 
 mod adjustment;
+mod batch_means;
 mod belief;
 mod common_time;
 mod curve;

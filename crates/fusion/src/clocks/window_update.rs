@@ -85,14 +85,18 @@ impl JumpTest<'_> {
             return WindowUpdate::Accepted(Box::new(belief));
         }
         let mut best = fitting.map(|adjusted| (adjusted.clone(), self.belief.clone()));
+        let without_jump = plain.as_ref().map_or(1.0, |adjusted| adjusted.inflation);
         for camera in suspects {
             let mut doubting = self.belief.clone();
-            doubting.doubt(camera);
+            doubting.doubt_jumped(camera);
             let Some(adjusted) = adjust(&doubting, self.window, &self.components).filter(fits)
             else {
                 continue;
             };
-            let evidence = adjusted.evidence - JUMP;
+            // Evidence of bearings that repeat one another is overstated as their information is. A
+            // clock that is free fits their errors too, and hides that they repeat.
+            let inflation = adjusted.inflation.max(without_jump);
+            let evidence = adjusted.evidence - JUMP * inflation;
             if best.as_ref().is_none_or(|(best, _)| evidence > best.evidence) {
                 best = Some((AdjustedCameras { evidence, ..adjusted }, doubting));
             }
@@ -111,6 +115,7 @@ impl JumpTest<'_> {
 
     fn learnt(&self, mut belief: Belief, adjusted: &AdjustedCameras) -> Belief {
         belief.learn(&self.components, &adjusted.cameras, &adjusted.covariance);
+        belief.see_inflation(&self.window.cameras, adjusted.inflation);
         belief
     }
 
@@ -130,7 +135,7 @@ impl JumpTest<'_> {
         let (first, last) = self.window.span()?;
         let later = self.window.without_early((first + last) / 2.0, camera);
         let mut doubting = self.belief.clone();
-        doubting.doubt(camera);
+        doubting.doubt_jumped(camera);
         let after = adjust(&doubting, &later, &self.components).filter(fits)?;
         let much_better = plain.is_none_or(|plain| strange(&after) * BETTER < strange(plain));
         let before = adjust(&self.belief, &later, &self.components).filter(fits);

@@ -1,5 +1,6 @@
 //! Clocks that are wrong, and what a fusion centre makes of them over a series of flights.
 
+use std::collections::BTreeMap;
 use std::time::Instant;
 
 use crossfix_fusion::{ClockEstimate, Fusion, FusionConfig};
@@ -63,6 +64,30 @@ fn with_clocks(mut frames: Vec<BearingFrame>, clocks: &[Clock]) -> Vec<BearingFr
     frames
 }
 
+/// How long an error of a bearing lasts, s.
+const LASTS_S: f64 = 1.0;
+
+/// Displaces the bearings by an error of each camera of this deviation, rad per axis, that is
+/// `exp(-t / LASTS_S)` of what it was after a time t.
+fn displace(frames: &mut [BearingFrame], sd: f64, seed: u64) {
+    let mut rng = ChaCha8Rng::seed_from_u64(30_000 + seed);
+    let mut errors: BTreeMap<String, (i64, Vector3<f64>)> = BTreeMap::new();
+    for frame in frames {
+        let mut drawn = Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(&mut rng) }) * sd;
+        if let Some((before_ns, error)) = errors.get(&frame.camera) {
+            let kept = (-(frame.capture_time_ns - before_ns) as f64 / 1e9 / LASTS_S).exp();
+            drawn = error * kept + drawn * (1.0 - kept.powi(2)).sqrt();
+        }
+        errors.insert(frame.camera.clone(), (frame.capture_time_ns, drawn));
+        for track in &mut frame.tracks {
+            let direction = Vector3::from(track.bearing.unwrap());
+            track.bearing = Some((direction + drawn).normalize().into());
+            track.covariance_xx += sd.powi(2);
+            track.covariance_yy += sd.powi(2);
+        }
+    }
+}
+
 fn clock_of(fusion: &Fusion, camera: &str) -> Option<ClockEstimate> {
     fusion.cameras().find(|report| report.camera.as_str() == camera)?.clock
 }
@@ -88,6 +113,9 @@ pub struct Tally {
     /// Standard deviations of the cameras' poses, rad and m per axis: calibrations are off by these,
     /// and say so.
     pub pose_sd: (f64, f64),
+    /// Standard deviation of what lasts of the bearings' errors, rad per axis. It counts in the
+    /// covariances, but nobody says that it lasts.
+    lasting_sd: f64,
     frames: u32,
     seconds: f64,
     slowest: f64,
@@ -102,6 +130,11 @@ impl Tally {
     /// A series of flights before cameras whose poses are off.
     pub fn of_wrong_poses(rotation_sd: f64, position_sd: f64) -> Self {
         Self { pose_sd: (rotation_sd, position_sd), ..Self::default() }
+    }
+
+    /// A series of flights whose bearings err by as much, rad per axis, for a second or so.
+    pub fn of_lasting_errors(lasting_sd: f64) -> Self {
+        Self { lasting_sd, ..Self::default() }
     }
 
     /// Root mean square of the errors, s.
@@ -128,7 +161,10 @@ impl Tally {
     pub fn fly(&mut self, scene: &Scene, clocks: &[Clock], seed: u64) {
         let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
         self.knock(&mut fusion, scene, seed);
-        let frames = scene.frames(seed);
+        let mut frames = scene.frames(seed);
+        if self.lasting_sd > 0.0 {
+            displace(&mut frames, self.lasting_sd, seed);
+        }
         let truths: Vec<f64> =
             frames.iter().map(|frame| frame.capture_time_ns as f64 / 1e9).collect();
         let mut settled: f64 = 0.0;
