@@ -123,10 +123,12 @@ impl CalibratedCamera {
         let place = (self.range_m, self.camera.pose().rotation());
         let direction = model.direction(pixel)?;
         let lens = self.lens.covariance_px2(model.intrinsics(), &direction, place);
+        // sqrt(tr C / 2): root mean variance over both axes.
         let lens_px = lens.map_or(f64::INFINITY, |lens| (lens.trace() / 2.0).sqrt());
         if lens_px > MOST_LENS_SHARE * self.noise.sd_px() {
             return Err(BearingError::Uncovered { sd_px: lens_px });
         }
+        // The lasting part is said in the calibration's message: white noise would average it away.
         let sd_px = self.noise.white_px.hypot(lens_px);
         Ok(model.bearing(pixel, PixelCovariance::isotropic(sd_px))?)
     }
@@ -168,6 +170,7 @@ impl CalibratedCamera {
     pub fn common_time(&self, own: Timestamp, row: f64) -> (Timestamp, f64) {
         let height = f64::from(self.camera.model().intrinsics().size.height);
         let (ahead_s, sd_s) = self.clock.at(own.seconds());
+        // The frame's time is that of the middle row.
         let row_s = self.clock.readout_s * (row / height - 0.5);
         (own.plus_seconds(ahead_s + row_s), sd_s)
     }

@@ -147,6 +147,7 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
     let later: Vec<Option<f64>> = pairs.iter().map(|(one, other)| later_s(one, other)).collect();
     let mut known: Vec<f64> = later.iter().copied().flatten().collect();
     known.sort_unstable_by(f64::total_cmp);
+    // The median: a clock that was set again must not make all others late.
     let common_s = known.get(known.len() / 2).copied().filter(|_| has_move);
     let all = sights.concat();
     let stays = SiteMove::none(&all)?;
@@ -216,6 +217,7 @@ fn site_move(mut moved: SiteMove, cameras: &[Vec<ComparedPixel>]) -> Option<Site
         }
         let step = information.cholesky()?.solve(&right);
         moved.shift += step.fixed_rows::<3>(0);
+        // The turn is about the world's axes, hence from the left.
         moved.turn = Rotation3::new(step.fixed_rows::<3>(3).into_owned()) * moved.turn;
         moved.size *= 1.0 + step[6].clamp(-0.5, 0.5);
     }
@@ -239,6 +241,7 @@ fn camera(
         let before = moved.applied(sight.target) - sight.from;
         before.cross(&sight.direction).norm().atan2(before.dot(&sight.direction))
     };
+    // Root mean square; an angle's square is that of two axes, hence the halves below.
     let mean = |value: &dyn Fn(&ComparedPixel) -> f64| {
         (sights.iter().map(value).sum::<f64>() / sights.len() as f64).sqrt()
     };

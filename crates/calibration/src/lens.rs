@@ -96,6 +96,7 @@ impl LensFreedom {
             Self::Focal => 1,
             Self::All | Self::Guess => deviations.len(),
         };
+        // The logarithm of the focal length is the first parameter: `Focal` frees it alone.
         deviations[free..].fill(HELD_SD);
         deviations
     }
@@ -200,6 +201,7 @@ fn by_pose(
     (range_m, world_from_camera): (f64, &nalgebra::Rotation3<f64>),
 ) -> nalgebra::Matrix2x6<f64> {
     let mut by_pose = nalgebra::Matrix2x6::zeros();
+    // R <- R exp(d) turns the point by point x d, and a centre moved by c moves it by -R' c.
     let turn = seen.by_point * (direction * range_m).cross_matrix();
     by_pose.fixed_columns_mut::<3>(0).copy_from(&turn);
     let by_centre = -seen.by_point * world_from_camera.matrix().transpose();
@@ -260,6 +262,8 @@ fn brown_conrady(k: &[f64; 5], point: &Vector3<f64>) -> Option<OnPlane> {
 /// `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
 fn fisheye(k: &[f64; 4], point: &Vector3<f64>) -> Option<OnPlane> {
     let r2 = point.x * point.x + point.y * point.y;
+    // On the axis the direction across is undefined: a radius of next to nothing keeps the
+    // quotients finite.
     let r = r2.sqrt().max(1e-9 * point.norm());
     let length2 = r2 + point.z * point.z;
     if length2 <= 0.0 {

@@ -354,6 +354,8 @@ impl Correlator {
         self.centred = centred;
         let count = (width * height) as f32;
         for (score, square) in scores.samples_mut().iter_mut().zip(self.moments.square.samples()) {
+            // sum (h - g)^2 = sum h^2 - 2 sum h g + sum g^2; the mean square is h's, hence the
+            // count.
             *score = -(square * count - 2.0 * *score + energy).max(0.0).sqrt();
         }
     }

@@ -120,6 +120,7 @@ impl<T: KernelTerm> Slide<'_, T> {
         for y in 1..tall {
             (upper, lower) = self.two_lines(simd, column, row + y, y, upper, lower);
         }
+        // The last row of the gate that only the lower placements reach.
         lower = self.line(simd, column, row + tall, tall - 1, lower);
         self.store::<S, V>(column, row, upper);
         self.store::<S, V>(column, row + 1, lower);
@@ -136,6 +137,7 @@ impl<T: KernelTerm> Slide<'_, T> {
         mut sums: [S::f32s; V],
     ) -> [S::f32s; V] {
         let gate = self.gate.padded_from(column, gate_row);
+        // One kernel sample meets V vectors of neighbouring placements, each one sample further on.
         for (&k, samples) in self.kernel.row(y).iter().zip(gate.windows(V * S::F32_LANES)) {
             let k = simd.splat_f32s(k);
             let (samples, _) = S::as_simd_f32s(samples);

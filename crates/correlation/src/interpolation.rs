@@ -50,8 +50,11 @@ fn prefilter() -> [f32; 2 * REACH + 1] {
     let pole = 3.0_f32.sqrt() - 2.0;
     let mut taps = [0.0; 2 * REACH + 1];
     for (k, tap) in taps.iter_mut().enumerate() {
+        // The pole z is the root of z^2 + 4 z + 1 inside the unit circle: (1, 4, 1) / 6 are the
+        // spline's weights at a sample.
         *tap = pole.powi(k.abs_diff(REACH) as i32);
     }
+    // Normalised after the cut: a constant brightness keeps its value.
     let sum: f32 = taps.iter().sum();
     taps.map(|tap| tap / sum)
 }
@@ -206,6 +209,7 @@ impl PlaneSpline {
         let (width, height) = (to.value.width(), to.value.height());
         to.by_x.reshape(width, height);
         to.by_y.reshape(width, height);
+        // The coefficients begin MARGIN samples before the image.
         let margin = MARGIN as f64;
         let (fx, fy) =
             resampler.support(&self.coefficients, left + margin, top + margin, &to.value);
@@ -325,6 +329,7 @@ impl WithSimd for Turned<'_> {
             let v = row as f32;
             for (column, out) in to.row_mut(row).iter_mut().enumerate() {
                 let u = column as f32;
+                // start + scale R(turn) (u, v).
                 let (x, y) = (start[0] + cos * u - sin * v, start[1] + sin * u + cos * v);
                 // Between the four samples about (x, y): along the two rows first, then down.
                 let (i, j) = (x as usize, y as usize);

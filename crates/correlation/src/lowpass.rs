@@ -25,6 +25,7 @@ pub struct LowPassMemory {
 impl LowPass {
     /// A filter with this standard deviation in pixels; 0 changes nothing.
     pub fn new(deviation: f32) -> Self {
+        // Three deviations of the Gaussian.
         let reach = ((3.0 * deviation).ceil() as usize).min(MOST_REACH);
         let mut taps: Vec<f32> = (0..=2 * reach)
             .map(|k| {

@@ -76,6 +76,7 @@ impl WithSimd for BoxMeans<'_> {
             for (mean, sum) in out.row_mut(top).iter_mut().zip(sums) {
                 *mean = sum * share;
             }
+            // The oldest row goes out before the next one comes in.
             accumulate(columns, gate.row(top), squares, -1.0);
         }
     }

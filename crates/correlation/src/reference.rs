@@ -49,6 +49,7 @@ impl Window {
     /// the sum of the squared weights.
     pub fn effective_pixels(&self) -> f64 {
         let squares = |plane: &Plane| plane.samples().iter().map(|w| f64::from(w * w)).sum::<f64>();
+        // n = 1 / sum w^2 for weights that sum to 1; the sum of products is the product of sums.
         1.0 / (squares(&self.columns) * squares(&self.rows))
     }
 

@@ -46,6 +46,7 @@ fn clusters(candidates: &[Pairing]) -> Vec<Vec<Pairing>> {
             [*rows.entry(candidate.row).or_insert(i), *columns.entry(candidate.column).or_insert(i)]
         {
             let (a, b) = (find(&mut leader, first), find(&mut leader, i));
+            // Union-find: candidates that share a row or a column have one leader.
             leader[a.max(b)] = a.min(b);
         }
     }

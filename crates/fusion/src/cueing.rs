@@ -189,6 +189,7 @@ fn seen(
         })
         .collect();
     let sum: Vector3<f64> =
+        // Mean direction of the nodes, put back on the sphere.
         models.iter().map(|(weight, model, _)| model.direction.into_inner() * *weight).sum();
     let direction = Unit::try_new(sum, 1e-9)?;
     let tangents = tangent_basis(&direction).transpose();

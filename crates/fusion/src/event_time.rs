@@ -205,11 +205,13 @@ impl EventBuffer {
     fn go_on(&mut self) {
         let (mut first_s, mut second_s) = (0.0_f64, 0.0_f64);
         for (stream, _) in self.streams() {
+            // The two largest in one pass: what is pushed from the first place is in the second.
             second_s = second_s.max(stream.gone_s.min(first_s));
             first_s = first_s.max(stream.gone_s);
         }
         // Where there is only one camera, nobody else can look silent.
         let share = if self.streams().count() > 1 { ALONE } else { 1.0 };
+        // run = g2 + ALONE (g1 - g2), and never back.
         self.run_s = self.run_s.max(second_s + share * (first_s - second_s));
     }
 
@@ -242,6 +244,7 @@ impl EventBuffer {
         let reached = newest_first(live.iter().map(|s| s.newest.plus_seconds(s.step_s)).collect());
         let half = live.len() / 2;
         let time = match (newest.as_slice(), reached.get(half)) {
+            // The second newest, but no later than what half of the cameras have reached.
             ([_, second, ..], Some(reached)) => Some(*second.min(reached)),
             ([alone], _) => Some(*alone),
             _ => None,
@@ -381,6 +384,7 @@ impl EventBuffer {
         let slowest = lately.map(|s| s.newest.plus_seconds(-s.disorder_s(lateness_s))).min();
         // Of the cameras that have ended, nothing more comes; of the others, nothing before
         // `slowest`.
+        // The later of the two: a slow camera holds the others up by the lateness at most.
         Some(slowest.map_or(patience, |slowest| slowest.max(patience)))
     }
 }

@@ -295,6 +295,8 @@ impl Fusion {
             return self.refuse(exposure.refused(RejectionReason::Duplicate), outputs);
         }
         self.corrected.insert(exposure, reported, ());
+        // No exposure to come can be corrected to before this: times come in order, less the
+        // largest offset.
         let settled = reported.plus_seconds(-self.clocks.largest_offset());
         while let Some((next, ())) = self.corrected.pop_settled(Some(settled)) {
             self.process(&next, outputs);
@@ -322,6 +324,8 @@ impl Fusion {
                 .calibrate(&moved, self.cameras.known(&moved).map(|known| known.pose_covariance));
             self.initiator.forget(&moved);
         }
+        // Tracks first learn what has changed of the camera: the exposure is compared by what is
+        // known now.
         if let Some(change) = self.cameras.clock_change(exposure) {
             self.tracker.set_clock(&exposure.camera, change);
         }

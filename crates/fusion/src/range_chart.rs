@@ -105,6 +105,7 @@ impl StateChart {
             Self::ByRange(chart) => {
                 let state_by = point.state_by;
                 let covariance = state_by * covariance * state_by.transpose();
+                // From state to chart at the old point, from chart to state at the new one.
                 (covariance, state_by * left * chart.by_state(), state_by * gain)
             }
         }

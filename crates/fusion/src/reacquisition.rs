@@ -61,6 +61,7 @@ impl ReacquisitionContext<'_> {
         else {
             return Vec::new();
         };
+        // P(detected) = P(visible) P_D.
         let detection = track.visible_to(&exposure.camera, exposure.time, motion)
             * config.detection_probability;
         let open = exposure.sightings.iter().enumerate();
@@ -146,6 +147,7 @@ impl Reacquisition {
             let mut next: Vec<_> =
                 before.into_iter().filter_map(|leaf| context.advanced(leaf, track.id)).collect();
             next.extend(context.begun(track));
+            // Old leaves and new ones compete for the same few places.
             next.sort_by(|a, b| b.0.log_ratio.total_cmp(&a.0.log_ratio));
             next.truncate(MAX_LEAVES);
             match next.first() {

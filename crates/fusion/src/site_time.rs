@@ -98,6 +98,8 @@ impl Rhythm {
         let since_s = time.seconds_since(self.time);
         let step = since_s - due_s;
         // Where numbers are missing for long, the rhythm does not say when the next was due.
+        // A frame that only comes early may follow one that was late; a clock that has stepped back
+        // shows a time before the last one.
         let is_known = due_s <= LIVE_S && (step > 0.0 || since_s < 0.0);
         (is_known && step.abs() > LEAST_STEP_S.max(LEAST_STEP_PERIODS * self.period_s))
             .then_some(step)
@@ -114,6 +116,7 @@ impl Rhythm {
             // to show again.
             (self.period_s, self.frames) = (0.0, 0);
         } else if step.is_none() {
+            // A plain mean at first, exponential later.
             let share = PERIOD_SHARE.max(f64::from(self.frames + 1).recip());
             self.period_s += (since_s / numbers as f64 - self.period_s) * share;
             self.frames = self.frames.saturating_add(1);
@@ -142,6 +145,7 @@ impl ClockStep {
         let numbers = now.sequence.saturating_sub(self.before.sequence);
         let off_s =
             now.time.seconds_since(self.before.time) - numbers as f64 * self.before.period_s;
+        // If the others have gone on as well, time has really passed.
         let stood_still = self.step_s > 0.0 && self.others_s > SHARE_OF_STEP * self.step_s;
         numbers >= 2 && (off_s - self.step_s).abs() < LEAST_STEP_S && !stood_still
     }
@@ -299,6 +303,7 @@ impl SiteTime {
     }
 
     fn live(&self) -> impl Iterator<Item = (&CameraName, &Rhythm)> {
+        // `gone_s` sums over all cameras, so it grows by their number in each second.
         let longest_s = LIVE_S * self.rhythms.len() as f64;
         self.rhythms.iter().filter(move |(_, rhythm)| self.gone_s - rhythm.heard_s <= longest_s)
     }

@@ -182,6 +182,8 @@ impl Track {
         motion: &MotionSetup,
     ) -> Self {
         let mut track = Self::start(fix, [(camera, line, uncertainty)], motion);
+        // One camera alone: nothing holds the range, and what moves along the sight line is not
+        // seen.
         (track.held, track.ranged, track.follower) = (false, false, Some(line.line.origin));
         // A wrong pose does not change how fast the direction turns: the velocity is not tied to
         // it.
@@ -242,6 +244,7 @@ impl Track {
         // The position's part of the sum of X X' over the cameras.
         let shared: f64 =
             self.ties.values().map(|t| t.covariance.fixed_rows::<3>(0).norm_squared()).sum();
+        // tr P - |X_p|^2: what is left if poses and clocks were exact.
         let sd = (self.position_sd().powi(2) - shared).max(0.0).sqrt();
         sd <= MAX_PAIR_SHARE * self.range()
     }
@@ -381,6 +384,7 @@ impl Track {
         if anew.is_some() {
             self.renew(camera);
         }
+        // The errors outside the state are carried once, with the mean of all models' updates.
         let nis = self.carry((camera, uncertainty.lasting), (time, interval), &results);
         self.gather_information(interval, line, uncertainty);
         self.updated = time;
@@ -406,6 +410,8 @@ impl Track {
     /// line unseen: this motion is added for the time since.
     fn range_again(&mut self, line: &SightLine, motion: &MotionSetup) {
         let sees = |ties: &&Ties| ties.sees(self.updated, motion.holding_s);
+        // Only the step from two cameras to one adds motion; later bearings find `ranged` false
+        // already.
         let is_ranged = self.ties.values().filter(sees).count() >= 2;
         if std::mem::replace(&mut self.ranged, is_ranged) && !is_ranged {
             let silent = self.ties.values().filter_map(|ties| ties.silent_s(self.updated));
@@ -438,6 +444,8 @@ impl Track {
         next.fixed_view_mut::<3, 3>(0, 3).copy_from(&tied);
         next.fixed_view_mut::<3, 3>(3, 0).copy_from(&tied.transpose());
         next.fixed_view_mut::<3, 3>(3, 3).copy_from(&moved);
+        // Old information fades by exp(-dt / T): a bearing of long ago says little of the motion
+        // now.
         next *= (-interval.abs() / INFORMATION_S).exp();
         if let Some(told) = told_of_position(self.state().position(), line, uncertainty) {
             let mut position = next.fixed_view_mut::<3, 3>(0, 0);

@@ -224,6 +224,7 @@ impl Tracker {
             let expected =
                 track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
             let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
+            // ln(N / clutter), P_D left out: it is the same for both times that are compared.
             fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
         };
         self.tracks.values().filter(|track| track.is_confirmed()).filter_map(best).sum()

@@ -72,6 +72,7 @@ impl SharedErrors {
     pub(crate) fn renewed(&self) -> Option<(Self, f64)> {
         let probability = self.renewal?;
         let mut ties = self.ties;
+        // A new draw is correlated with nothing, has mean 0 and unit variance.
         ties.fixed_columns_mut::<2>(LASTING).fill(0.0);
         Some((Self { ties, ..Self::unknown() }, probability))
     }
@@ -93,6 +94,7 @@ impl CorrelatedNoise {
 
     /// Variance of white noise that averages out as slowly over bearings `interval_s` apart, rad^2.
     pub(crate) fn as_white(&self, interval_s: f64) -> f64 {
+        // rho = exp(-t / T).
         let kept = (-interval_s.max(1e-3) / self.time_s).exp();
         // The sum of rho^|k| over all k is (1 + rho) / (1 - rho).
         self.variance() * (1.0 + kept) / (1.0 - kept)
@@ -193,6 +195,7 @@ impl CameraUncertainty {
     /// bearings of a while, and more bearings do not average them away.
     pub(crate) fn shifts(&self, model: &BearingModel, velocity: Vector3<f64>) -> Shifts {
         let mut shifts = Shifts::zeros();
+        // A factor on the variance is its root on the shift.
         let pose = self.declared_pose(model) * self.pose_scale.sqrt();
         shifts.fixed_view_mut::<2, 2>(0, 0).copy_from(&pose);
         if self.time_sd_s > 0.0 && !self.clock_is_noise {
@@ -217,6 +220,7 @@ impl CameraUncertainty {
         } else {
             Vector2::zeros()
         };
+        // f R + c c', c the shift by one deviation of the clock.
         own * self.factor + clock * clock.transpose()
     }
 
@@ -256,6 +260,7 @@ impl CameraUncertainty {
 /// The lower triangular root of a covariance; of a singular one, the part that exists.
 fn root(covariance: &Matrix2<f64>) -> Matrix2<f64> {
     let first = covariance.m11.max(0.0).sqrt();
+    // Cholesky by hand: L = [a, 0; b, c], a = sqrt(m11), b = m12 / a, c = sqrt(m22 - b^2).
     let across = if first > 0.0 { covariance.m12 / first } else { 0.0 };
     Matrix2::new(first, 0.0, across, (covariance.m22 - across * across).max(0.0).sqrt())
 }

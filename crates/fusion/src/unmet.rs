@@ -172,6 +172,7 @@ impl PairComparisons {
     /// Whether both cameras have seen something in most comparisons, and these are enough.
     fn is_steady(&self) -> bool {
         let both = self.shown.iter().filter(|shown| shown.finding().is_some()).count();
+        // Half of the memory is enough to say something.
         self.shown.len() * 2 >= REMEMBERED && both as f64 >= LEAST_SHARE * self.shown.len() as f64
     }
 
@@ -306,6 +307,8 @@ impl Unmet {
         let total = |finding: &PairFinding| {
             steady.iter().map(|(_, pair)| pair.count(*finding)).sum::<usize>()
         };
+        // The commonest finding of all steady pairs, and of these pairs the one that shows it most
+        // often.
         let most =
             PairFinding::ALL.into_iter().filter(|finding| total(finding) > 0).max_by_key(total)?;
         let (cameras, pair) = steady.into_iter().max_by_key(|(_, pair)| pair.count(most))?;

@@ -118,6 +118,8 @@ pub(crate) fn updated(
     };
     // P and X in the chart's coordinates, whose origin is the prior mean.
     let (covariance, ties) = chart.expressed(&prior.covariance, &errors.ties);
+    // In the range chart a bearing of the following camera itself measures the direction alone,
+    // linearly: one round is enough.
     let is_own = seen_from == Some(line.origin);
     let mut coordinates = Vector6::zeros();
     if !is_own && seen_from.is_some() && covariance.m33 > VAGUE_LOG_RANGE_SD.powi(2) {

@@ -46,6 +46,7 @@ impl Bearing {
             return Err(GeometryError::NotUnit { length });
         }
         let [xx, xy, yy] = [covariance.m11, covariance.m12, covariance.m22];
+        // Sylvester: all leading minors are positive.
         if xx <= 0.0 || yy <= 0.0 || xx * yy <= xy * xy {
             return Err(GeometryError::NotPositive { xx, xy, yy });
         }

@@ -193,6 +193,7 @@ impl CameraModel {
     pub fn sees(&self, direction: &Vector3<f64>) -> bool {
         let ImageSize { width, height } = self.intrinsics.size;
         self.project(direction).is_some_and(|p| {
+            // Pixel 0 reaches from -1/2 to 1/2.
             (-0.5..f64::from(width) - 0.5).contains(&p.x())
                 && (-0.5..f64::from(height) - 0.5).contains(&p.y())
         })
@@ -306,6 +307,7 @@ impl Camera {
             return None;
         }
         let bearing = self.model.bearing(self.model.project(&place)?, covariance).ok()?;
+        // |u x p| = |p| sin of the angle between both directions.
         let across = bearing.direction().cross(&place).norm();
         (across < FOLDED_RAD * place.norm()).then(|| self.sight_line(&bearing))
     }

@@ -46,6 +46,7 @@ impl BearingModel {
     /// Offset of a measured line from the expected direction, rad; `None` if the line points to the
     /// opposite half space.
     pub fn offset(&self, line: &SightLine) -> Option<Vector2<f64>> {
+        // z = E' u_measured: the expected direction itself has no part along its own tangents.
         (self.direction.dot(&line.direction) > 0.0)
             .then(|| self.basis.transpose() * line.direction.into_inner())
     }

@@ -95,6 +95,7 @@ impl PanTilt {
 /// The same angle plus or minus whole turns, within bounds; where none is, the nearer bound.
 fn nearest_turn(angle: f64, [least, most]: [f64; 2]) -> f64 {
     use std::f64::consts::TAU;
+    // The limits lie within a turn either way, so one turn more or less is enough.
     let turns = [angle, angle - TAU, angle + TAU];
     let beyond = |angle: &f64| (angle - angle.clamp(least, most)).abs();
     let nearest = turns.into_iter().min_by(|a, b| beyond(a).total_cmp(&beyond(b)));

@@ -83,6 +83,7 @@ impl ScanAngles {
         let (sin_azimuth, cos_azimuth) = self.azimuth.sin_cos();
         let (sin_elevation, cos_elevation) = self.elevation.sin_cos();
         Matrix3x2::from_columns(&[
+            // d/dphi of (cos theta sin phi, sin theta, cos theta cos phi), then d/dtheta.
             Vector3::new(cos_azimuth, 0.0, -sin_azimuth) * cos_elevation,
             Vector3::new(-sin_elevation * sin_azimuth, cos_elevation, -sin_elevation * cos_azimuth),
         ])

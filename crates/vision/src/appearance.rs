@@ -226,6 +226,7 @@ impl Appearance {
             (0..height).map(|y| (middle(one, width, height, y), middle(two, width, height, y)));
         let product: f32 =
             rows.flat_map(|(one, two)| one.iter().zip(two)).map(|(a, b)| a * b).sum();
+        // <a, b> / sqrt(E_a E_b), with the energies less their noise: E clear.
         let clear = self.clear_share() * other.clear_share();
         product / (self.energy() * other.energy() * clear).max(1e-12).sqrt()
     }
@@ -280,6 +281,7 @@ impl Appearance {
     /// Share of the reference's energy that is the target's and not noise: a noisy reference finds
     /// the target fainter than it is.
     pub(crate) fn clear_share(&self) -> f32 {
+        // 1 - n v / E: the energy of a noisy reference contains that of its noise.
         let noise = self.noise() * self.pixels();
         (1.0 - noise / self.energy().max(f32::MIN_POSITIVE)).clamp(0.2, 1.0)
     }
@@ -311,6 +313,8 @@ impl Appearance {
         let noise_share =
             self.anchor_noise * view.samples().len() as f32 / energy(&self.anchor).max(1e-12);
         if noise_share > ANCHOR_NOISE_SHARE {
+            // Running mean, each image weighted by its certainty; its noise is (1 - s)^2 v + s^2
+            // v_new.
             anchor_share = certainty / (self.anchor_images + 1.0);
             for (old, new) in self.anchor.samples_mut().iter_mut().zip(view.samples()) {
                 *old += anchor_share * (new - *old);
@@ -386,6 +390,7 @@ impl Appearance {
         working.update(|image| {
             image.reshape(odd(*scale * width + 0.5), odd(*scale * height + 0.5));
             let middle = [width, height].map(|side| (side - 1.0) / 2.0);
+            // The working reference samples the own one, so the inverse scale and turn are used.
             let (scale, turn_rad) = (1.0 / *scale, -*turn_rad);
             buffers.resampler.resample(
                 smooth,
@@ -430,6 +435,7 @@ impl Appearance {
         };
         let fit = fitter.fit(filtered, &self.memory, 0.0, 0.0, options);
         self.drift = Drift {
+            // One Gauss-Newton step is trusted for a pixel, and for a tenth in log scale and turn.
             x: fit.x.clamp(-1.0, 1.0),
             y: fit.y.clamp(-1.0, 1.0),
             log_scale: fit.log_scale.clamp(-0.1, 0.1),
@@ -440,6 +446,7 @@ impl Appearance {
 
     /// Converts a displacement in the reference's own pixels to one in the image.
     pub(crate) fn in_image(&self, drift: Drift) -> [f64; 2] {
+        // d_image = s R(turn) d.
         let (cos, sin) = (self.scale * self.turn_rad.cos(), self.scale * self.turn_rad.sin());
         [cos * drift.x - sin * drift.y, sin * drift.x + cos * drift.y]
     }

@@ -215,6 +215,7 @@ impl PixelSums {
         if n < LEAST_PIXELS {
             return None;
         }
+        // Over the pixels that count the reference has a mean and an energy of its own.
         let energy = self.reference_squared - self.reference * self.reference / n;
         if energy <= (LEAST_FREE * whole).max(f64::from(f32::MIN_POSITIVE)) {
             return None;
@@ -229,6 +230,7 @@ impl PixelSums {
         Some(ArrivalEvidence {
             now: contrast(self.reference_now, self.now),
             before: contrast(self.reference_before, self.before),
+            // Var(a / E) = v E / E^2.
             variance: noise / energy,
             change: self.change_squared() / n / unchanged,
             looks: (n / PIXELS_A_LOOK).min(MOST_LOOKS),

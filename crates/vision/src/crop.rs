@@ -44,6 +44,8 @@ pub(crate) fn crop(image: &Plane, corner: [isize; 2], sides: [usize; 2], part: &
     {
         return;
     }
+    // Left and right first, along the rows that are inside; above and below then continue the whole
+    // width, so that the corners are filled too.
     let (left, right) = borders(&columns);
     for border in
         [left, right].into_iter().filter(|border| !border.beyond(sides[0], &columns).is_empty())

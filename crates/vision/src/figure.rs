@@ -64,6 +64,7 @@ impl ConnectedRegion {
     pub(crate) fn place(&self, corner: [isize; 2], least: [f64; 2]) -> PixelBox {
         let Self { low, high, middle, .. } = *self;
         let side = |i: usize| {
+            // Half side: the farther of the two corners from the middle.
             let reach = (middle[i] - low[i] as f64).max(high[i] as f64 - middle[i]);
             (2.0 * reach + 1.0).ceil().max(least[i])
         };
@@ -91,6 +92,8 @@ pub(crate) fn figure(
     let threshold = threshold(off.row(seed[1])[seed[0]], spread);
     loop {
         let region = connected(off, seed, gap, threshold)?;
+        // The gap grows with the region until it bridges nothing more: a large thing has large gaps
+        // between its parts.
         let longest = (region.high[0] - region.low[0]).max(region.high[1] - region.low[1]) + 1;
         let wider = (GAP * longest as f64) as usize;
         if wider <= gap {
@@ -149,6 +152,7 @@ pub(crate) fn smoothed(image: &Plane, corner: [isize; 2], [width, height]: [usiz
 /// path from it to the border. What goes on beyond the border (a horizon, a mast) does not stand
 /// out, however bright or dark.
 fn standing_out(window: &Plane) -> Plane {
+    // What is dark fills with water; what is bright does so upside down.
     let upside_down = Plane::from_fn(window.width(), window.height(), |x, y| -window.row(y)[x]);
     let [dark, bright] = [window, &upside_down].map(depths);
     Plane::from_fn(window.width(), window.height(), |x, y| dark.row(y)[x].max(bright.row(y)[x]))
@@ -215,6 +219,7 @@ pub(crate) fn meant(image: &Plane, given: PixelBox, given_sd: f64, noise_sd: f32
     let mut figures = windows.filter_map(|share| {
         figure_within(image, given, given_sd, share * (FURTHEST * given_sd + GROUND_PX), noise_sd)
     });
+    // From the widest window down: the first that shows a single thing decides.
     figures.next().filter(|figure| !fits(given, *figure)).unwrap_or(given)
 }
 

@@ -112,6 +112,8 @@ impl ImageTracker {
                     ImageTrack { id: self.tracks[shown].id, certainty, ..self.tracks[instead] };
             }
         }
+        // Candidates are numbered from above, so that all numbers beyond the next one are
+        // candidates'.
         self.tracks.retain(|track| track.id.0 <= self.next_candidate);
     }
 
@@ -185,6 +187,8 @@ impl ImageTracker {
             {
                 let gone = [at.x - first.x, at.y - first.y];
                 let in_scene = [gone[0] + turned[0] - then[0], gone[1] + turned[1] - then[1]];
+                // What is on the lens keeps its place in the image, what belongs to the scene its
+                // place there: only the smaller of both distances shows a target.
                 *has_moved |= gone[0].hypot(gone[1]).min(in_scene[0].hypot(in_scene[1])) > side;
             }
         }

@@ -74,6 +74,8 @@ impl TargetBelief {
         // The reference may have drifted off its anchor meanwhile.
         let drift = self.appearance.in_image(self.appearance.drift);
         let place = ImagePoint { x: origin[0] + fit.x + drift[0], y: origin[1] + fit.y + drift[1] };
+        // The fit's variances are proportional to noise / gain^2; this makes them those at
+        // `contrast`.
         let scaled = noise * (fit.gain / contrast).powi(2);
         let Drift { log_scale, turn_rad, .. } = self.appearance.drift;
         let shape = fit.shape_variances(scaled).map(|[scale, turn]| {

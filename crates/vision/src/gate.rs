@@ -39,6 +39,8 @@ impl Region {
         let expected = state.motion.found();
         let reference = state.appearance.working.image();
         let reference = [reference.width(), reference.height()];
+        // The reference's sides are odd: the middle of a placement is (side - 1) / 2 from its
+        // corner.
         let origin = [0, 1].map(|i| expected[i].position.round() - half[i] as f64);
         let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
         Self { half, origin, corner, sides: [0, 1].map(|i| 2 * half[i] + reference[i]) }
@@ -90,8 +92,12 @@ impl TargetBelief {
         let (peak, expected) = (self.peak_half(), self.motion.found());
         let half = [0, 1].map(|i| {
             let spread = (sigmas * expected[i].variance.sqrt()).ceil() as usize;
+            // What lies beyond twice the peak's half side is the posterior's background: some of it
+            // must be left about a peak at the edge of the spread.
             (spread + 3 * peak[i]).min(whole[i])
         });
+        // A middle of more than two thirds of the gate would spare too little if the rest is needed
+        // too.
         (3 * half[0] * half[1] < 2 * whole[0] * whole[1]).then_some(half)
     }
 
@@ -110,6 +116,7 @@ impl TargetBelief {
         // A chain of two states, whose share of visible images in the long run is the configured
         // one.
         let often = config.visible_probability;
+        // v+ = v_inf + (v - v_inf) exp(-T / tau), with v = 1 - hidden.
         let visible = often + (1.0 - hidden - often) * stays_hidden;
         PlacePrior {
             centre: [0, 1].map(|i| expected[i].position - region.origin[i]),

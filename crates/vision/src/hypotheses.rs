@@ -64,6 +64,7 @@ impl PlaceHypothesis {
         let (one, two) = (self.motion.velocity(), other.motion.velocity());
         let (a, b) = (self.motion.covariances(), other.motion.covariances());
         let near = |off: f64, variance: f64| off.abs() < SAME * variance.sqrt();
+        // |x1 - x2| < 2 max(s1, s2) on both axes, in place and in velocity.
         let faster = [one.x - two.x, one.y - two.y];
         let alike = (0..2).all(|i| {
             near(here[i].position - there[i].position, here[i].variance.max(there[i].variance))
@@ -187,6 +188,8 @@ impl PlaceHypotheses {
         region: Region,
         scratch: &mut Scratch,
     ) -> Option<(ImageMotion, Posterior)> {
+        // Joint posterior of hypothesis and place: w_h times the evidence times the mass near the
+        // peak.
         let near = state.peak_half();
         let mut ways: Vec<(f64, usize, Posterior)> = Vec::with_capacity(self.all.len());
         let mut all = 0.0;
@@ -207,6 +210,7 @@ impl PlaceHypotheses {
             |peak: [usize; 2]| (0..2).all(|i| peak[i].abs_diff(posterior.peak[i]) <= near[i]);
         let there: f64 =
             ways.iter().filter(|(.., way)| here(way.peak)).map(|(mass, ..)| mass).sum();
+        // Several hypotheses may lead to one place: their masses there count together.
         (there > DOUBT * all).then(|| (self.all[best].motion.clone(), posterior))
     }
 
@@ -228,6 +232,7 @@ impl PlaceHypotheses {
             let weight = hypothesis.weight * posterior.evidence;
             branches.push(PlaceHypothesis {
                 weight: weight * posterior.unseen,
+                // Not seen: the prediction stays as it is.
                 motion: hypothesis.motion.clone(),
                 hidden: 1.0,
                 peak: None,
@@ -279,6 +284,7 @@ fn kept(mut all: Vec<PlaceHypothesis>) -> Vec<PlaceHypothesis> {
             None => {}
         }
     }
+    // All weights zero, or one not a number: no hypothesis is left to be believed.
     let total: f64 = kept.iter().map(|hypothesis| hypothesis.weight).sum();
     if total.is_nan() || total <= 0.0 {
         return Vec::new();

@@ -93,6 +93,8 @@ impl Identity {
         if state.unseen_s > 0.0 || self.probation.is_some() {
             return;
         }
+        // `turned` is that of this image already; with `moved` it is that of the image before, in
+        // which `last_seen` is.
         let (turned, moved) = (frame.scene.turned(), frame.scene_moved);
         let ImagePoint { x, y } = state.last_seen;
         self.last_in_scene = Some([x + turned[0] + moved[0], y + turned[1] + moved[1]]);
@@ -138,10 +140,14 @@ impl Identity {
         let Scratch { buffers, comparison, .. } = scratch;
         comparison.take(frame.image, placed, &mut buffers.resampler);
         let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
+        // It has moved on from a picture's time if its speed would have taken it farther than its
+        // length since.
         let speed = self.speed_px_s.max(self.least_speed(state, frame, place));
         let mut against = |picture: &ScenePicture, then: ImagePoint| {
             let seen = self.place_in(picture);
             let has_moved_on = speed * picture.age_s() > longest;
+            // A picture tells only if the target was elsewhere in it: at a place that is known, or
+            // lost and gone on since.
             if seen.is_none() && !(self.was_lost(state, picture) && has_moved_on) {
                 return None;
             }
@@ -154,6 +160,7 @@ impl Identity {
         let mut turned = pictures().filter(|picture| has_turned(picture.then(place)));
         let lens = turned.find_map(|picture| against(picture, place));
         let scene = scene.map_or(0.0, |arrival| arrival.log_ratio(usual));
+        // The worse of both: it must have come into the scene and must not be on the lens.
         lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(usual)))
     }
 
@@ -173,6 +180,7 @@ impl Identity {
         let Some([x, y]) = self.last_in_scene else { return 0.0 };
         let turned = frame.scene.turned();
         let lost_s = self.probation.as_ref().map_or(state.unseen_s, |probation| probation.unseen_s);
+        // |place in the scene now - place in the scene when last seen| / time lost.
         (place.x + turned[0] - x).hypot(place.y + turned[1] - y) / lost_s.max(frame.interval)
     }
 
@@ -227,6 +235,7 @@ impl Identity {
         let Some(before) = self.probation.take() else { return false };
         (state.motion, state.unseen_s, state.last_seen) =
             (before.motion, before.unseen_s, before.last_seen);
+        // The images missed on probation count as well, so that it is still searched for.
         state.missed = state.missed.max(before.missed);
         self.in_pictures.retain(|(number, _)| *number <= before.picture);
         true

@@ -23,6 +23,7 @@ pub(crate) fn exp(x: f32) -> f32 {
 pub(crate) fn ln(x: f32) -> f32 {
     // x = 2^e m with m between sqrt(1/2) and sqrt(2).
     let bits = x.to_bits() as i32;
+    // 0x3f3504f3 is sqrt(1/2) in bits.
     let exponent = (bits - 0x3f35_04f3) >> 23;
     let mantissa = f32::from_bits((bits - (exponent << 23)) as u32);
     // ln m = 2 artanh((m - 1) / (m + 1)).

@@ -46,6 +46,7 @@ impl TargetBelief {
         let seen = certainty > SEEN;
         if seen {
             let clear = f64::from(self.appearance.clear_share());
+            // The reference's noise is taken out: z / clear, with the variance v / (E clear^2).
             let measured = fit.contrast / clear;
             let variance = f64::from(self.noise / self.appearance.energy().max(1e-12))
                 / clear.powi(2)
@@ -80,6 +81,8 @@ impl TargetBelief {
         let mut steps = [0.0; 2];
         for i in 0..2 {
             let (change, variance) = shape[i];
+            // A change that is badly known or too large for one image is a misfit, not a change of
+            // shape.
             if variance < 0.1 && change.abs() < limits[i] {
                 let known = &mut self.shape_variances[i];
                 // Kalman gain P / (P + R) of the log scale, then of the turn.
@@ -95,6 +98,7 @@ impl TargetBelief {
     pub(crate) fn forget_contrast(&mut self, interval: f64) {
         let share = (interval / FADES_S).min(1.0);
         self.contrast += share * (self.usual_contrast - self.contrast);
+        // Towards a standard deviation of half the usual contrast.
         self.contrast_variance +=
             share * ((0.5 * self.usual_contrast).powi(2) - self.contrast_variance);
     }

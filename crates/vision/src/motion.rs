@@ -170,6 +170,8 @@ impl ImageMotion {
         acceleration_sd: f64,
     ) -> Self {
         let all = given.map(|AxisMeasurement { position, variance }| {
+            // P = v o o', o = [1, 0, -1]': H o = 0, so that the given place's error is not in where
+            // the reference is found.
             let off = Vector3::new(1.0, 0.0, -1.0);
             let mut covariance = off * off.transpose() * variance;
             covariance[(VELOCITY, VELOCITY)] = velocity_sd.powi(2);
@@ -203,6 +205,7 @@ impl ImageMotion {
         }
         self.ways = [self.all; WAYS];
         self.weights = AT_FIRST;
+        // The place is the measurement itself: a gain of 1 in the position, 0 in the other states.
         (self.gains, self.measured) = ([[Vector3::x(); 2]; WAYS], found.map(|at| at.variance));
     }
 
@@ -211,6 +214,7 @@ impl ImageMotion {
     pub(crate) fn start(&mut self, second: [AxisMeasurement; 2], interval: f64) {
         for i in 0..2 {
             let first = self.all[i];
+            // The first place's error is the offset's, with the opposite sign (`at_rest`).
             let first_variance = first.covariance[(OFFSET, OFFSET)];
             let (at, variance) = (second[i].position, second[i].variance);
             for (way, acceleration) in self.ways.iter_mut().zip(self.accelerations) {
@@ -248,6 +252,7 @@ impl ImageMotion {
     pub(crate) fn take_place(&mut self, given: [AxisMeasurement; 2]) {
         for way in &mut self.ways {
             for (axis, given) in way.iter_mut().zip(given) {
+                // S = P11 + R, K = P e1 / S, P -= K S K'.
                 let variance = axis.covariance[(POSITION, POSITION)] + given.variance;
                 let gain = axis.covariance.column(POSITION) / variance;
                 axis.mean += gain * (given.position - axis.mean[POSITION]);
@@ -271,6 +276,8 @@ impl ImageMotion {
             let stayed = stays * *weight;
             *weight = stayed + drawn;
             for (axis, all) in way.iter_mut().zip(&self.all) {
+                // Given that the model holds now, it held before with probability stayed / w;
+                // otherwise the state is drawn from the mixture.
                 *axis = axis.mixed(stayed / *weight, all);
                 axis.predict(interval, acceleration);
             }
@@ -281,6 +288,7 @@ impl ImageMotion {
         for (i, side) in sides.into_iter().enumerate() {
             let edge = side as f64 - 1.0;
             if !(0.0..=edge).contains(&self.all[i].mean[POSITION]) {
+                // Every model is put at the border, so that the mixture is there too.
                 let held = self.all[i].mean[POSITION].clamp(0.0, edge);
                 for axis in self.ways.iter_mut().map(|way| &mut way[i]).chain([&mut self.all[i]]) {
                     (axis.mean[POSITION], axis.mean[VELOCITY]) = (held, 0.0);
@@ -344,6 +352,8 @@ impl ImageMotion {
                 let AxisMeasurement { position, variance } = way[i].found();
                 *part = (weight, AxisMeasurement { position, variance: variance + at[i].variance });
             }
+            // The squared normal deviate of the mixture's tail probability: chi-square also where
+            // the mixture is not normal.
             normal_score(at[i].position, parts).powi(2)
         };
         axis(0) + axis(1)
@@ -358,6 +368,7 @@ impl ImageMotion {
     /// both axes (`nis`), as far as the innovation consists of noise and not of motion.
     pub(crate) fn match_noise(&mut self, nis: f64) {
         self.matched_s = (self.matched_s + self.interval).min(MATCHED_S);
+        // A running mean at first, with `AT_LEAST_S` of expected noise in it; exponential later.
         let share = (self.interval / (self.matched_s + AT_LEAST_S)).min(1.0);
         // Relative step: told (nis / 2 - 1), whose mean is 0 if the noise is right, and the pull
         // back.
@@ -411,6 +422,8 @@ impl ImageMotion {
                 let prior = axis.found();
                 // The Kalman update K = P / (P + R) of where the reference is found ...
                 let gain = prior.variance / (prior.variance + at[i].variance);
+                // 1 - K = R / (P + R) is the noise's share of the innovation's variance; halved for
+                // the mean over both axes.
                 told[way] += (1.0 - gain) / 2.0;
                 let here = AxisMeasurement {
                     position: prior.position + gain * (at[i].position - prior.position),
@@ -424,6 +437,8 @@ impl ImageMotion {
                 let spread = |(mass, part): &(f64, AxisMeasurement)| {
                     mass * (part.variance + (part.position - position).powi(2))
                 };
+                // However far off the other places are, one image widens the prediction to twice
+                // its standard deviation at most.
                 let variance = parts.iter().map(spread).sum::<f64>().min(4.0 * prior.variance);
                 // The regression splits the gain over the states: part to the position, the rest to
                 // the offset.
@@ -462,11 +477,13 @@ impl ImageMotion {
         let shifted = Matrix3::new(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, -share, 0.0, 1.0 - share);
         // Where a variance is given the image's noise goes into the covariances below instead.
         let new = if variances.is_none() { share * share } else { 0.0 };
+        // Noise of a mean: (1 - s)^2 of the old variance, s^2 of the new one.
         self.untold = (1.0 - share).powi(2) * self.untold + new;
         let place = [place.x, place.y];
         for (way, gains) in self.ways.iter_mut().zip(&self.gains) {
             for i in 0..2 {
                 let axis = &mut way[i];
+                // b += s (place - x - b): the mean of the line above, without v.
                 let off = place[i] - axis.mean[POSITION];
                 axis.mean[OFFSET] += share * (off - axis.mean[OFFSET]);
                 let new = Vector3::new(0.0, 0.0, share);

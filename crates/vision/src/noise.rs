@@ -64,6 +64,7 @@ impl NoiseMeter {
                 }
             }
         }
+        // sigma = 1.4826 median(|response|) / 6.
         let deviation = OF_MEDIAN * median(&mut self.responses) / MASK_GAIN;
         (deviation * deviation).max(floor * floor)
     }

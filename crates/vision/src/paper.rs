@@ -32,6 +32,8 @@ impl PaperTarget {
         let side = |length: f64| (times * length).round().max(1.0) as usize;
         let (width, height) = (side(place.width), side(place.height));
         let (first, start) = crop(image, centre, width, height);
+        // The reference is cut at whole pixels; the box's middle lies off its middle by a part of
+        // one.
         let middle = [
             centre.x - start[0] - (width as f64 - 1.0) / 2.0,
             centre.y - start[1] - (height as f64 - 1.0) / 2.0,
@@ -141,6 +143,7 @@ impl PaperTarget {
             ];
             Some(innovations.iter().map(Innovation::normalised_squared).sum())
         } else {
+            // The second measurement starts the filters (Herasymenko 2021, eqs. 13-14).
             self.take_place(image, place, interval, config);
             None
         };

@@ -116,6 +116,7 @@ impl PosteriorMap {
             .sum();
         let all: f64 = self.sums.iter().map(|sums| f64::from(sums.ratio)).sum();
         let away = (width * height).saturating_sub(wide[0].len() * wide[1].len()).max(1) as f64;
+        // A placement that tells nothing has the ratio 1, which is exp(-largest) in these units.
         let background = ((all - inside) / away).max(f64::from(-largest).exp());
         // P(unseen) : P(seen) = (1 - visible) background : visible mass.
         let unseen = (1.0 - prior.visible) / prior.visible * background;
@@ -150,6 +151,7 @@ impl PosteriorMap {
         for row in rows {
             let line = self.weights.row_mut(row);
             line[columns.clone()].fill(0.0);
+            // Only the rows' maxima are kept up to date: the next peak needs no more.
             self.sums[row].best = line.iter().copied().fold(0.0, f32::max);
         }
         (peak, part)
@@ -197,10 +199,12 @@ fn part(mass: f64, first: [f64; 2], second: [f64; 2]) -> PosteriorPart {
 /// The rest of a whole when a part is taken out, by the difference of their moments.
 fn without(whole: PosteriorPart, taken: PosteriorPart) -> PosteriorPart {
     let rest = whole.mass - taken.mass;
+    // What is left of two nearly equal sums is rounding, and has next to no mass.
     if rest <= 1e-6 * whole.mass {
         return taken;
     }
     let sums = |p: PosteriorPart| {
+        // Back from moments to sums: sum w x^2 = (var - 1/12 + mean^2) mass.
         let second = [0, 1].map(|i| (p.variance[i] - 1.0 / 12.0 + p.mean[i] * p.mean[i]) * p.mass);
         (p.mean.map(|m| m * p.mass), second)
     };
@@ -245,6 +249,7 @@ impl WithSimd for Weigh<'_> {
 
 #[inline(always)]
 fn row_sums(ratios: &[f32], weights: &[f32]) -> RowSums {
+    // Eight sums side by side can be vectorised; the order of a single one could not be changed.
     let mut lanes = [RowSums::default(); 8];
     for (block, (ratios, weights)) in ratios.chunks(8).zip(weights.chunks(8)).enumerate() {
         for (lane, (ratio, weight)) in ratios.iter().zip(weights).enumerate() {

@@ -66,6 +66,8 @@ impl RegistrationEquations {
         let [x, y] = [self.slope_off[0] - sx * off / n, self.slope_off[1] - sy * off / n];
         // ... and solved by Cramer's rule: (slope slope') step = slope off.
         let determinant = xx * yy - xy * xy;
+        // A single straight edge tells no shift along itself: the determinant vanishes against the
+        // squared trace.
         let told = determinant > 1e-6 * (xx + yy).powi(2) && determinant > 0.0;
         let step = [(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant];
         told.then(|| step.map(|s| s.clamp(-LONGEST_STEP, LONGEST_STEP)))
@@ -93,6 +95,7 @@ fn each_off(
             // Linear interpolation between four pixels, and its derivatives.
             let [upper, lower] = [a + right * (b - a), c + right * (d - c)];
             let slope = [(b - a) + down * ((d - c) - (b - a)), lower - upper];
+            // off = now(x) - then(x + shift).
             take([x, y], slope, line[x] - upper - down * (lower - upper));
         }
     }
@@ -183,6 +186,7 @@ fn is_about([x, y]: [usize; 2], [column, row]: [usize; 2]) -> bool {
 
 /// Reduction of the mean square, times the present sum of weights.
 fn gain_of(before: (f32, f32), now: (f32, f32)) -> f32 {
+    // Means are compared, as the two shifts have different numbers of pixels in common.
     let mean = |(squares, weights): (f32, f32)| squares / weights.max(f32::MIN_POSITIVE);
     (mean(before) - mean(now)) * now.1
 }
@@ -197,6 +201,7 @@ pub(crate) fn registered(now: &Plane, then: &Plane, first: [f32; 2]) -> Option<[
     let mut shift = first;
     let mut normal = normal_at(now, then, shift);
     let brighter = |normal: &RegistrationEquations| normal.off / normal.weight.max(1.0);
+    // Mean difference of brightness at the first guess; the misfit there is computed without it.
     let before = brighter(&normal);
     for _ in 0..STEPS {
         let [x, y] = normal.step()?;

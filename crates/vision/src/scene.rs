@@ -114,8 +114,10 @@ impl RowGlance {
                 changes.push(change);
             }
         }
+        // The median of the changes: targets change a few blocks, a jerk most of them.
         let change = median(changes);
         let is_jerk = change > JERK * *usual + JERK_LEVELS;
+        // A jerk enters the usual change only as far as the threshold.
         *usual += USUAL_SHARE * (change.min(JERK * *usual + JERK_LEVELS) - *usual);
         is_jerk
     }
@@ -151,6 +153,7 @@ impl SceneMemory {
 
     /// Shift of the scene since the beginning: what is at (x, y) was at (x, y) plus this, px.
     pub(crate) fn turned(&self) -> [f64; 2] {
+        // Shift until the newest picture, plus the shift since then.
         let since = self.pictures.first().map_or([0.0; 2], |newest| newest.shift);
         [0, 1].map(|i| self.turned[i] + since[i])
     }
@@ -171,7 +174,10 @@ impl SceneMemory {
             picture.age_s += interval;
         }
         let is_jerked = self.glance.is_another(image);
+        // Half an interval is added so that the image nearest to the time is used.
         let is_time = is_jerked || !self.is_still || self.unlooked_s + interval / 2.0 >= STILL_S;
+        // A picture that will be kept needs its coarse version and its shift, whatever the camera
+        // does.
         let is_kept = self.pictures.first().is_none_or(|newest| newest.age_s >= SPACING_S);
         if !is_time && !is_kept {
             return;
@@ -189,6 +195,7 @@ impl SceneMemory {
             for (shift, (now, before)) in
                 picture.shift.iter_mut().zip(newest.shift.iter().zip(before))
             {
+                // The older pictures turn by as much as the newest one has since the image before.
                 *shift += now - before;
             }
         }
@@ -249,6 +256,7 @@ impl SceneMemory {
             for (x, out) in out.iter_mut().enumerate().take(known.end).skip(known.start) {
                 let i = (x as isize + left) as usize;
                 let along = |row: &[f32]| row[i] + right * (row[i + 1] - row[i]);
+                // I(x) - I_then(x + shift).
                 *out = image.row(y)[x] - along(above) - down * (along(below) - along(above));
             }
         }
@@ -260,6 +268,7 @@ impl SceneMemory {
 /// they determine no turn.
 fn turned(now: &Plane, then: &Plane, before: [f64; 2]) -> [f64; 2] {
     let coarseness = COARSENESS as f64;
+    // From the last shift on: registration finds only shifts near its first guess.
     let told = registered(now, then, before.map(|turned| (turned / coarseness) as f32));
     told.map_or(before, |turned| turned.map(|turned| f64::from(turned) * coarseness))
 }

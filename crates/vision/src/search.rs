@@ -70,6 +70,7 @@ fn coarse_reference(
     resampler: &mut Resampler,
 ) -> Reference {
     let working = state.appearance.working.image();
+    // Odd again, so that the reference has a middle pixel on the coarse picture too.
     let side = |length: usize| 2 * (length / (2 * coarseness)) + 1;
     let (width, height) = (side(working.width()), side(working.height()));
     let mut whole = Plane::from_fn(width * coarseness, height * coarseness, |_, _| 0.0);
@@ -120,6 +121,8 @@ impl Coarse {
         let covariances = scratch.statistics.covariance.samples();
         let SearchScratch { contrasts, .. } = &mut scratch.search;
         contrasts.clear();
+        // z = cov / var is the contrast at a placement; its standard deviation about zero follows
+        // from the median of |z|, which the few placements on the target do not change.
         contrasts.extend(covariances.iter().map(|covariance| covariance.abs()));
         let deviation =
             OF_MEDIAN * median(contrasts) / self.reference.variance().max(f32::MIN_POSITIVE);
@@ -175,6 +178,8 @@ impl Sought<'_> {
         let mut change = std::mem::take(&mut scratch.search.change);
         let searches = self.memory.searches;
         let is_change = searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
+        // A cycle of four searches: change and image by the last appearance, then both by the
+        // first.
         if searches / 2 % 2 == 1 {
             self.memory.take_first(self.state, frame.config, &mut scratch.buffers);
         }
@@ -213,6 +218,7 @@ impl Sought<'_> {
             coarseness,
         };
         let area = SearchArea::new(state, image, &coarse, is_change, config);
+        // The scene of a moment ago is the background of the image; in the change it has cancelled.
         if !is_change {
             remember_background(self.memory, state, frame, &coarse, scratch);
         }
@@ -233,6 +239,7 @@ impl Sought<'_> {
             crop(frame.image, peak.corner, peak.sides, &mut scratch.gate);
         }
         let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
+        // A noisy reference finds the target fainter than it is, by the clear share.
         let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
         let accepted = peak.log_ratio - best.background > LEAST_RATIO
             && best.margin > MARGIN
@@ -283,6 +290,7 @@ impl TargetBelief {
         log_ratios(&scratch.statistics, self.expectation(noise, energy, pixels, config), fine);
         let peak = fine.peak();
         let covariance = scratch.statistics.covariance.row(peak.row)[peak.column];
+        // z = a / E, with a = n cov.
         let contrast = f64::from(covariance * pixels / energy.max(1e-12)).max(0.0);
         BestPlacement {
             column: peak.column,
@@ -397,6 +405,7 @@ impl SearchArea {
             let across = (self.middle(row) - predicted[1]).powi(2) / variances[1];
             for (x, column) in ranges[0].clone().enumerate() {
                 let ratio = &mut scratch.ratios.row_mut(y)[x];
+                // The reference found this much of the target in the empty scene already.
                 *ratio -= self.background_at(column, row, state, memory);
                 // If even the largest prior does not reach the best, the logarithm is spared.
                 if f64::from(*ratio) + (density + flat).ln() <= most {

@@ -66,6 +66,7 @@ impl TargetBelief {
         let corner = [centre.x - around[0] as f64 / 2.0, centre.y - around[1] as f64 / 2.0];
         crop(image, corner.map(|at| at as isize), around, &mut scratch.gate);
         let noise = scratch.meter.variance(&scratch.gate, config.noise_floor as f32);
+        // Error of drawing the box, and of its middle as the target's own place.
         let variance = config.given_sd_px.powi(2) + config.centre_sd_px.powi(2);
         let given = [centre.x, centre.y].map(|position| AxisMeasurement { position, variance });
         Self {
@@ -136,6 +137,7 @@ impl TargetBelief {
         config: &TrackerConfig,
     ) -> Expectation {
         let contrast = self.contrast * f64::from(self.appearance.clear_share());
+        // Change from image to image, and the error of the estimate so far.
         let variance = (config.contrast_sd * contrast).powi(2) + self.contrast_variance;
         Expectation {
             // The floor makes sure that a reference of nothing is found nowhere.

@@ -331,6 +331,7 @@ impl ImageTracker {
             self.scene.register(image, interval);
         }
         let after = self.scene.turned();
+        // What is at p now was at p + turned at first: the same thing has moved by before - after.
         let scene_moved = [0, 1].map(|i| before[i] - after[i]);
         let frame = FrameInput {
             image,
@@ -347,6 +348,7 @@ impl ImageTracker {
             .followed
             .iter()
             .filter(|f| f.target.is_searching() && f.stand_in.is_none() && !f.is_candidate())
+            // The one whose last search is longest ago; those never searched for come first.
             .min_by_key(|f| f.searched)
             .map(|f| f.id);
         for followed in &mut self.followed {

@@ -45,6 +45,7 @@ impl FlightState {
         let AdjustmentModel { flight, priors, gauge } = model;
         self.jerk_rows(priors, sink);
         self.rest_rows(sink);
+        // A log says which way is up; without one the cameras do.
         match flight.log {
             Some(log) => self.log_rows(log, sink),
             None => self.level_rows(flight, sink),
@@ -90,6 +91,7 @@ impl FlightState {
             sink.take(&[(vec![(start + unknown, sd.recip())], value / sd)], Tails::Normal);
         };
         for axis in 0..3 {
+            // A rotation has no zero to be pulled to: only the step is.
             hold(axis, 0.0, WIDE_ROTATION_RAD);
             hold(axis + 3, camera.centre[axis], WIDE_M);
         }
@@ -170,6 +172,7 @@ pub(super) fn adjust(
             }
             damping *= DAMPING_STEP;
         }
+        // Also where no damping has led to a better state: the cost is then what it was.
         if before - cost < settled {
             break;
         }

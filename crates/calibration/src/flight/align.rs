@@ -54,12 +54,15 @@ pub(super) fn to_survey(
         turn(&arms).filter(|_| places.len() >= ENOUGH_PLACES)
     } else {
         // A camera's known pose also tells where its axes point.
+        // Axes as long as the longest arm weigh as much in the sum as a place there.
         let length = arms.iter().map(|(here, _)| here.norm()).fold(1.0, f64::max);
         let axes = [Vector3::x(), Vector3::y(), Vector3::z()].map(|axis| axis * length);
         let turned = rotations.iter().flat_map(|(here, there)| axes.map(|a| (here * a, there * a)));
         arms.extend(turned);
         turn(&arms)
     };
+    // Too few places for a rotation: upright by the images' rows, then turned to where the places
+    // are.
     let rotation = rotation.unwrap_or_else(|| about(&arms, upright(&state.cameras)));
     Ok((SimilarityTransform { rotation, scale, from, to }.moved(state), scale))
 }
@@ -118,6 +121,7 @@ impl Correspondences {
                 for c in b + 1..tried.len() {
                     let three = [tried[a], tried[b], tried[c]];
                     let Some(shown) = SimilarityTransform::of_three(&three) else { continue };
+                    // The median over all places: half of them may be wrong.
                     let misfit =
                         linear::median(self.places.iter().map(|place| shown.misfit(place)));
                     if best.as_ref().is_none_or(|(least, _)| misfit < *least) {
@@ -129,8 +133,10 @@ impl Correspondences {
         let Some((misfit, shown)) = best else { return self };
         let (_, to) = middles(&self.places);
         let spread = linear::median(self.places.iter().map(|(_, there)| (there - to).norm()));
+        // FAR times the median misfit, but at least LEAST_FAR of the spread.
         let most = FAR * misfit.max(LEAST_FAR / FAR * spread);
         self.places.retain(|place| shown.misfit(place) <= most);
+        // R_there' R R_here is the turn that is left of a pose when the site is moved by R.
         self.rotations.retain(|(here, there)| {
             turn_vector(&(there.inverse() * shown.rotation * here)).norm() < FAR_TURNED_RAD
         });
@@ -143,6 +149,7 @@ impl Correspondences {
         let site = |(here, there): &(Rotation3<f64>, Rotation3<f64>)| there * here.inverse();
         let apart = |a: &Rotation3<f64>, b: &Rotation3<f64>| turn_vector(&(a.inverse() * b)).norm();
         let said: Vec<Rotation3<f64>> = self.rotations.iter().map(site).collect();
+        // The medoid: the rotation with the least median distance from all.
         let median = |one: &Rotation3<f64>| linear::median(said.iter().map(|b| apart(one, b)));
         let middle = said.iter().min_by(|a, b| median(a).total_cmp(&median(b))).copied();
         if let Some(middle) = middle.filter(|_| said.len() > 2) {
@@ -237,6 +244,8 @@ fn size(places: &[(Point3<f64>, Point3<f64>)]) -> Option<f64> {
         places[..k].iter().map(move |b| ((a.0 - b.0).norm(), (a.1 - b.1).norm()))
     });
     let (here, there) = pairs.fold((0.0, 0.0), |sum, pair| (sum.0 + pair.0, sum.1 + pair.1));
+    // Ratio of the summed distances: long ones, which are known better by their share, count for
+    // more.
     (here > 0.0 && there > 0.0).then(|| there / here)
 }
 
@@ -292,6 +301,7 @@ fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rota
     let (sine, cosine) =
         arms.iter().map(level).fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1));
     let turned = Rotation3::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine)) * upright;
+    // The smallest turn that lays one arm on the other.
     let tip = |(here, there): &(Vector3<f64>, Vector3<f64>)| {
         let axis = Unit::try_new((turned * here).cross(there), 1e-9)?;
         Some(Rotation3::from_axis_angle(&axis, (turned * here).angle(there)))
@@ -310,6 +320,7 @@ impl SimilarityTransform {
             camera.rotation = self.rotation * camera.rotation;
         }
         for coefficient in &mut moved.way.coefficients {
+            // The B-spline's weights sum to 1: moving the coefficients moves the trajectory.
             *coefficient = place(Point3::from(*coefficient)).coords;
         }
         moved

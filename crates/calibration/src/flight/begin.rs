@@ -71,6 +71,7 @@ impl BegunFlight {
             begun.of_others.push((camera.name.clone(), others));
             begun.take(&own, start.map_err(|why| with_cure(camera, &begun.course, cameras, why)));
         }
+        // Only now is each clock known well enough to say which labels are of one time.
         begun.leave_lonely_out(true);
         if begun.cameras.is_empty() {
             let (camera, why) = begun.refused.into_iter().next().ok_or(FlightError::NoSolution)?;
@@ -146,6 +147,7 @@ impl BegunFlight {
                 times
             })
             .collect();
+        // Sorted times: the first that is not too early is the only one that has to be looked at.
         let is_near = |times: &Vec<f64>, time_s: f64| {
             let next = times.partition_point(|other| *other < time_s - TOGETHER_S);
             times.get(next).is_some_and(|other| *other < time_s + TOGETHER_S)
@@ -162,6 +164,7 @@ impl BegunFlight {
         let (cameras, states) =
             (std::mem::take(&mut self.cameras), std::mem::take(&mut self.states));
         for (camera, state) in cameras.into_iter().zip(states) {
+            // Too few labels may be left.
             let start = usable(&camera).map(|()| state);
             self.take(&camera, start);
         }
@@ -179,6 +182,7 @@ impl BegunFlight {
         self.course.lead(&mut way);
         let mut states = self.states.clone();
         states.iter_mut().for_each(|camera| camera.clock.wander = way.drift());
+        // Clocks and bias drift between knots that stand with the trajectory's.
         let bias = vec![way.drift(); if has_log { 3 } else { 0 }];
         FlightState { way, cameras: states, bias }
     }
@@ -203,6 +207,8 @@ impl BegunFlight {
                 .zip(&self.states)
                 .filter_map(|(c, s)| Some((of(c)?, s)))
                 .collect();
+            // Each camera that is placed makes the trajectory better, and cameras that did not fit
+            // before may fit it.
             self.course = Course::of(&triangulation::log(&placed))?;
             let before = self.cameras.len();
             self.refused.clear();
@@ -227,6 +233,8 @@ impl BegunFlight {
         let names = best.cameras.iter().map(|camera| &camera.name);
         let turns: Vec<[Rotation3<f64>; 2]> =
             names.filter_map(|name| Some([turn(self, name)?, turn(best, name)?])).collect();
+        // The two starts have different worlds: only the turn of one camera against the next can be
+        // compared.
         let stand_otherwise = turns.windows(2).any(|pair| {
             let [own, bests] = [0, 1].map(|k| pair[0][k].inverse() * pair[1][k]);
             turn_vector(&(own.inverse() * bests)).norm() > OTHERWISE_RAD
@@ -315,6 +323,8 @@ fn target_of(
         Some((Ok(start), own)) => (own, Ok(start)),
         _ => (camera.clone(), start),
     };
+    // Fewer labels are taken only if they give a start; the mirror image is tried with what is
+    // left.
     let start = start.and_then(|(state, misfit)| proven(&own, course, state, misfit));
     tracing::debug!(
         "camera `{}`: {} of {} labels are of the log's target",
@@ -337,6 +347,7 @@ fn first_priors(camera: &CameraLabels) -> CameraPriors {
 
 /// Whether a start lies near enough to a course.
 fn fits(misfit: f64, state: &CameraUnknowns, course: &Course) -> bool {
+    // m / m = rad: an error of the log, seen across from the median distance.
     let of_errors = LOG_DEVIATIONS * course.errors.sd_m.hypot(course.errors.drift_sd_m);
     misfit <= MOST_MISFIT_RAD + of_errors / course.middle_distance(state.centre)
 }
@@ -409,6 +420,7 @@ fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<BegunFlig
             known.extend(BeginWith::known(both, seen, survey));
         }
     }
+    // A pair of cameras has up to three poses; its least doubt ranks it.
     let doubt = |ways: &[BeginWith<'_>]| ways.iter().map(|p| p.doubt).fold(f64::INFINITY, f64::min);
     found.sort_by(|a, b| doubt(a).total_cmp(&doubt(b)));
     known.sort_by(|a, b| a.doubt.total_cmp(&b.doubt));
@@ -434,10 +446,12 @@ fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<BegunFlig
     });
     let mut begun: Vec<(BegunFlight, bool)> = begun.collect();
     begun.sort_by(|(a, _), (b, _)| {
+        // Most cameras first; of as many, the least misfit.
         let fewer = b.cameras.len().cmp(&a.cameras.len());
         fewer.then_with(|| a.misfit().total_cmp(&b.misfit()))
     });
     let ((best, _), others) = begun.split_first().ok_or(FlightError::NoPair)?;
+    // Before the rivals: an earlier calibration says which of two that fit alike is true.
     let as_good = |(other, is_known): &(BegunFlight, bool)| *is_known && other.fits_as(best);
     if let Some(index) = begun.iter().position(as_good) {
         return Ok(begun.swap_remove(index).0);

@@ -115,6 +115,7 @@ fn derivatives(
     // before.
     for (k, (index, _, seen)) in clicks[..=row / 2].iter().enumerate() {
         let by = whitening.view((row, 2 * k), (1, 2)) * &seen.by;
+        // A landmark tells nothing of the clock: its unknowns are skipped between pose and lens.
         let unknown = |own: usize| if own < POSE { own } else { own - POSE + POSE_AND_CLOCK };
         let own = by.iter().enumerate();
         terms.extend(own.map(|(own, value)| (starts[*index] + unknown(own), *value)));

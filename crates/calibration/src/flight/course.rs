@@ -36,6 +36,7 @@ impl Course {
         let bias = vec![way.drift(); 3];
         let mut state = FlightState { way, cameras: Vec::new(), bias };
         let mut priors = Priors { jerk: FIRST_JERK, rate_sd: RATE_SD, cameras: Vec::new() };
+        // The jerk's power and the trajectory by turns: each is estimated with the other as it is.
         for _ in 0..ROUNDS {
             let adjusted = adjustment::adjust(&flight, &priors, state, NEARLY_SETTLED)?;
             priors.jerk = jerk(&adjusted);
@@ -62,6 +63,7 @@ impl Course {
     pub(super) fn weights(&self, time_s: f64) -> Option<Weights> {
         let next = self.times_s.partition_point(|known| *known < time_s);
         let (before, after) = (self.times_s.get(next.wrapping_sub(1)), self.times_s.get(next));
+        // Between two known times the gap decides; beyond the ends one knot's spacing is allowed.
         let is_known = match (before, after) {
             (Some(before), Some(after)) => after - before <= self.gap_s,
             (_, Some(after)) => *after - time_s < KNOT_S,

@@ -53,6 +53,8 @@ impl Followers {
             part.view_mut((3, Datum::TURN), (3, 3)).copy_from(&-arm.cross_matrix());
             part.view_mut((3, Datum::GROWTH), (3, 1)).copy_from(&arm);
             part[(CLOCK, Datum::LATE)] = 1.0;
+            // A common time that gains by s: s (t - middle) in the offset at the clock's reference,
+            // s in its rate.
             part[(CLOCK, Datum::SLOW)] = reference(camera) - time_s;
             part[(CLOCK + 1, Datum::SLOW)] = 1.0;
         }

@@ -38,6 +38,7 @@ impl Gauge {
         let mut weight = DMatrix::zeros(followers.unknowns(), followers.unknowns());
         for start in &starts[..from.cameras.len()] {
             let own = start - first;
+            // rad^2 to m^2, so that turns and shifts are weighed alike.
             (0..3).for_each(|k| weight[(own + k, own + k)] = RANGE_M * RANGE_M);
             (3..CLOCK + 2).for_each(|k| weight[(own + k, own + k)] = 1.0);
         }

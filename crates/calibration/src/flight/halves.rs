@@ -36,6 +36,7 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &FlightState) -> Option
     let halves = [false, true].map(|is_late| half(flight, state, middle_s, is_late));
     let [first, second] = [0, 1].map(|k| {
         let flight = Flight { cameras: &halves[k], ..*flight };
+        // Both start from the whole flight's state and keep its noise: only the labels differ.
         adjustment::adjust(&flight, priors, state.clone(), NEARLY_SETTLED)
     });
     let (first, second) = (first?, second?);
@@ -139,6 +140,7 @@ impl DifferenceOfHalves {
             count += 1.0;
         }
         let most_px = MOST_STATED * noise.sd_px();
+        // Mean stated variance per axis below most_px^2.
         let is_told = stated > 0.0 && stated < 2.0 * count * most_px * most_px;
         is_told.then(|| (found / stated).sqrt())
     }

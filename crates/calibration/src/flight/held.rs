@@ -54,5 +54,6 @@ fn later_by_clock(found: &CameraResult, survey: &Survey) -> Option<(f64, f64)> {
     known.clock.knots_s.first()?;
     let middle = found.clock.knots.get(found.clock.knots.len() / 2)?;
     let (ahead_s, sd_s) = known.clock.at(middle.time_s);
+    // Compared in the middle of the flight, where its own rate matters least.
     Some((ahead_s - middle.ahead_s, sd_s.max(LEAST_CLOCK_SD_S)))
 }

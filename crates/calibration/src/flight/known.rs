@@ -44,6 +44,8 @@ impl FlightState {
         let by_lens = &known.lens.pose_by_lens;
         let covariance = DMatrix::from_column_slice(6, 6, known.pose_covariance.as_slice());
         if let Some(whitened) = whitening(&covariance) {
+            // L^-1 (pose - B lens), B the pose's regression on the lens: what the lens does not
+            // explain of the pose.
             let beside = &whitened * (&pose - by_lens * &lens);
             let follows = &whitened * by_lens;
             let row = |axis: usize| -> ResidualRow {

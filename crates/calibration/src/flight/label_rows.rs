@@ -41,6 +41,7 @@ impl FlightState {
                 let ahead = placed.first.checked_sub(earlier.first);
                 label.time_s - time_s < LONGEST_PAIR_S
                     && ahead.is_some_and(|ahead| ahead <= 1)
+                    // Both labels' unknowns must lie within the band of the chain.
                     && placed.touched().and(earlier.touched()).fit()
             });
             let whitening = priors
@@ -106,11 +107,13 @@ impl FlightState {
                 for (term, by_own) in own_terms.iter_mut().zip(&part.seen.by_own) {
                     *term += by_own[axis] * share;
                 }
+                // d(pixel) / d(knot) = d(pixel) / d(time) x the knot's weight.
                 for (knot, weight) in part.wander {
                     let by_knot = part.seen.by_time[axis] * weight * share;
                     terms.push((order.wander(knot, index), by_knot));
                 }
             }
+            // Four coefficients, or five where the two labels lie in neighbouring intervals.
             let used = 3 * (now.first - first + SPAN);
             let of_way = chain[..used].iter().enumerate();
             terms.extend(of_way.map(|(k, value)| (order.way(first + k / 3, k % 3), *value)));

@@ -81,6 +81,7 @@ fn quantile(numbers: impl Iterator<Item = f64>, share: f64) -> f64 {
 /// from round to round.
 pub(super) fn robust(pairs: &[DirectionToPlace]) -> Option<AffineMap> {
     let axes = Normalised::of(pairs)?;
+    // Iteratively reweighted: the scale of the weights is the misfit that most pairs stay below.
     let mut weights = vec![1.0; pairs.len()];
     let mut best: Option<(f64, AffineMap)> = None;
     for _ in 0..ROUNDS {

@@ -162,6 +162,7 @@ impl CameraUnknowns {
             by_time * (1.0 + self.clock.wander.slope(self.clock.straight_s(label.time_s)));
         by_own[CLOCK] = by_straight;
         by_own[CLOCK + 1] = by_straight * (label.time_s - self.clock.reference_s);
+        // The read-out is added after the clock's wander, so its derivative has no slope in it.
         by_own[CLOCK + 2] = by_time * self.row_share(label.pixel);
         by_own[POSE_AND_CLOCK..].copy_from_slice(&seen.by_lens);
         let residual = seen.pixel - Vector2::new(label.pixel.x(), label.pixel.y());

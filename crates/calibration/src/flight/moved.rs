@@ -54,11 +54,13 @@ pub(super) fn likeliest(labels: &[FittedLabel]) -> Option<MovedAt> {
     let last = blocks.len().checked_sub(LEAST_BLOCKS)?;
     let divided = (LEAST_BLOCKS..=last).map(|k| {
         let ((one, left), (other, right)) = (middle(&blocks[..k]), middle(&blocks[k..]));
+        // sd = 1.253 mean |x - median| of normal deviates.
         let sd = BY_MEAN * (left + right) / blocks.len() as f64;
         let by_px = (other - one).norm();
         let deviations = by_px / sd.max(f64::MIN_POSITIVE);
         (left + right, MovedAt { time_s: blocks[k].time_s, by_px, deviations })
     });
+    // The division that leaves the least sum of absolute deviations.
     divided.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, moved)| moved)
 }
 

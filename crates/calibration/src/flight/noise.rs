@@ -52,6 +52,7 @@ impl Tails {
         }
         let count = count as f64;
         let heavy = |freedom: f64| (freedom + count) * (squares / freedom).ln_1p();
+        // The constant that makes both parts equal where they join, at squares = count.
         let joined = |freedom: f64| match self {
             Self::Known => count - (freedom + count) * (count / freedom).ln_1p(),
             _ => 0.0,
@@ -110,6 +111,7 @@ impl LabelNoise {
         let variance = typical(residuals.iter().map(|(_, residual)| *residual)) + explained;
         let variance = variance.max(LEAST_SD_PX.powi(2));
         let steps = residuals.windows(2).filter(|pair| pair[1].0 - pair[0].0 < 1.5 * frame_s);
+        // Var(e2 - e1) / 2 = variance - covariance of neighbours.
         let of_steps = typical(steps.map(|pair| pair[1].1 - pair[0].1)) / 2.0;
         let of_means = typical(block_means(residuals).into_iter()) + explained;
         // Lasting variance for a correlation time, by the covariance of successive residuals:
@@ -128,6 +130,7 @@ impl LabelNoise {
         let (mut least, mut most) = (frame_s, LONGEST_S.max(2.0 * frame_s));
         for _ in 0..40 {
             let middle = f64::midpoint(least, most);
+            // A longer correlation leaves more of the variance in the means.
             if means(middle) < of_means { least = middle } else { most = middle }
         }
         let lasting = lasting(least);

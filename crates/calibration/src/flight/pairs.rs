@@ -75,6 +75,7 @@ impl Sights {
         let next = self.times_s.partition_point(|seen| *seen < time_s);
         let before = next.checked_sub(1)?;
         let (from, to) = (self.times_s[before], *self.times_s.get(next)?);
+        // Straight between two labels, then back to length one.
         let share = (time_s - from) / (to - from);
         let between = self.directions[before].lerp(&self.directions[next], share);
         (to - from <= self.gap_s).then(|| between.normalize())
@@ -108,6 +109,7 @@ pub(super) struct RelativePose {
 
 /// Directions that both see at a clock offset, in the first's frame and in the second's.
 fn common(first: &Sights, second: &Sights, ahead_s: f64) -> Vec<[Vector3<f64>; 2]> {
+    // The second's time is the first's less `ahead_s`.
     let both =
         |(time_s, direction): (f64, Vector3<f64>)| Some([direction, second.at(time_s - ahead_s)?]);
     first.times(TRIED).filter_map(both).collect()
@@ -119,6 +121,7 @@ fn essential(seen: &[[Vector3<f64>; 2]]) -> (Matrix3<f64>, f64) {
     for [a, b] in seen {
         let outer = b * a.transpose();
         let row = SMatrix::<f64, 9, 1>::from_column_slice(outer.as_slice());
+        // b' E a = sum of (b a')_ij E_ij: linear in E.
         sum.syger(1.0, &row, &row, 1.0);
     }
     sum.fill_upper_triangle_with_lower_triangle();
@@ -197,6 +200,7 @@ fn offset(
     let mut coarser = STEP_S;
     for step in FINER {
         let about = best.0;
+        // One coarser step to either side.
         let reach = (coarser / step) as i32;
         let offsets_s = (-reach..=reach).map(|k| about + f64::from(k) * step);
         best = best_offset(best, offsets_s, misfit);
@@ -229,6 +233,7 @@ fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Opti
         v_t.neg_mut();
     }
     let quarter = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
+    // u3' E = 0: the base line, whose sign and length E does not tell.
     let along: Vector3<f64> = u.column(2).into_owned();
     let poses = [quarter, quarter.transpose()].into_iter().flat_map(|quarter| {
         let second_from_first = u * quarter * v_t;
@@ -241,6 +246,7 @@ fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Opti
 /// The poses of a flight in a plane, if a plane explains it about as well.
 fn in_plane(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Vec<RelativePose> {
     let Some((matrix, in_plane_rad)) = plane::homography(seen) else { return Vec::new() };
+    // A plane has fewer free numbers: it must not fit much worse than the essential matrix.
     if in_plane_rad > PLANE_TIMES * misfit_rad {
         return Vec::new();
     }
@@ -269,11 +275,13 @@ impl RelativePose {
         ahead_s: f64,
         misfit_rad: f64,
     ) -> Option<(usize, Self)> {
+        // b ~ R a + t has its zero, the second's centre, at a = -R' t.
         let centre = Point3::from(-second_from_first.tr_mul(&shift) * BASE_M);
         let rotation = Rotation3::from_matrix_unchecked(second_from_first.transpose());
         let mut pair = Self { ahead_s, first_from_second: rotation, centre, doubt: 0.0 };
         let parallaxes: Vec<f64> = seen.iter().filter_map(|seen| pair.parallax(seen)).collect();
         let ahead = parallaxes.len();
+        // sd(r) / r of two lines is their misfit over the angle at which they meet.
         pair.doubt = misfit_rad / median(parallaxes.into_iter()) / (ahead as f64).sqrt();
         (2 * ahead >= seen.len()).then_some((ahead, pair))
     }

@@ -27,6 +27,7 @@ impl Piece {
     /// that is exceeded.
     fn away(&self, labels: &[Label], next: &Label, step_px: f64, frame_s: f64) -> Option<f64> {
         let last = &labels[*self.labels.last()?];
+        // The distance allowed grows with the frames since the last label.
         let frames = ((next.time_s - last.time_s) / frame_s).round();
         let [x, y] = [next.pixel.x() - last.pixel.x(), next.pixel.y() - last.pixel.y()];
         let share = x.hypot(y) / (step_px * frames);
@@ -83,6 +84,7 @@ pub(super) fn chains(pieces: &[Vec<Label>], width_px: f64) -> Vec<Vec<usize>> {
             links.extend(astray.map(|astray| (astray, before, after)));
         }
     }
+    // Greedy: the best links first, each piece with one before it and one after it at most.
     links.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut next_of: Vec<Option<usize>> = vec![None; pieces.len()];
     let mut has_before = vec![false; pieces.len()];

@@ -87,6 +87,7 @@ impl FlightState {
             return;
         }
         let (order, middle) = (self.order(), self.middle(seen));
+        // d(-pull ln S) / dc = -2 pull (c - middle) / S; the right side has minus half of that.
         let by_size2 = pull / self.size2(seen);
         for &k in seen {
             let arm = self.way.coefficients[k] - middle;

@@ -129,6 +129,8 @@ pub(super) fn results(
     let ratios = halves::ratios(flight, priors, &adjusted);
     let followers = Followers::of(&adjusted.state);
     let shown = followers.estimator(adjusted.covariance.information())?;
+    // What no measurement said of the site as a whole: the linearised jerk, and without a log the
+    // gauge.
     let mut prior_information = adjusted.state.of_linear_jerk(priors);
     if flight.log.is_none() {
         prior_information += Gauge::information();
@@ -137,6 +139,7 @@ pub(super) fn results(
     // A single camera has no datum: all that it is off by is its own.
     let datum = (flight.cameras.len() > 1).then_some(datum);
     if datum.is_some() {
+        // P - H D H': what a camera is off by beside the site as a whole.
         adjusted.covariance.take_off(shown.of_cameras());
     }
     let known: Vec<f64> = ratios.iter().copied().flatten().collect();
@@ -160,6 +163,7 @@ pub(super) fn results(
             name: flight.cameras[index].name.clone(),
             camera: Camera::new(camera.intrinsics, pose).ok()?,
             pose_covariance: at.pose_with_lens_held(lens::numbers(&camera.intrinsics))? * ratio,
+            // A factor on both covariances: the regression of pose on lens stays.
             lens: at.lens(lens::numbers(&camera.intrinsics), ratio)?,
             clock: clock_result(flight, &adjusted, index, prior.wander),
             noise: prior.noise,
@@ -172,6 +176,7 @@ pub(super) fn results(
             moved: moved::likeliest(&fitted),
             fitted,
             focal_ratio: camera.intrinsics.fx / prior.lens.fx,
+            // The first lens number is ln fx: its deviation is that of the ratio.
             focal_ratio_sd: at.covariance_of(POSE_AND_CLOCK, POSE_AND_CLOCK).sqrt(),
         });
     }

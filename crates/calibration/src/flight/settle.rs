@@ -33,6 +33,8 @@ pub(super) fn settle(
         let next = adjustment::adjust(flight, &priors, state, settled)?;
         state = next.state.clone();
         if !is_last {
+            // After the last round nothing is learnt: state and covariance belong to the priors
+            // that are returned.
             priors = learnt(flight, &next, &priors);
             tracing::debug!(
                 "round {round}: cost {:.1}, jerk {:.2} m^2/s^5",
@@ -101,6 +103,8 @@ fn explained(flight: &Flight<'_>, adjusted: &AdjustedFlight, index: usize, cauti
             let of_chain: Vec<Derivative> =
                 terms.iter().copied().filter(|(unknown, _)| *unknown < chain).collect();
             let held = adjusted.covariance.variance_held(&of_chain);
+            // Total variance = chain with the others fixed + part by the others; only the first is
+            // divided.
             sum += held / caution + adjusted.covariance.variance(&terms) - held;
             count += 1;
         }
@@ -137,6 +141,8 @@ pub(super) fn jerk(adjusted: &AdjustedFlight) -> f64 {
         sum += way.third_difference(first).norm_squared();
         for axis in 0..3 {
             let terms = [0, 1, 2, 3].map(|k| (order.way(first + k, axis), THIRD_DIFFERENCE[k]));
+            // E[d^2] = d_hat^2 + Var(d): without the variance the smoothed trajectory would show
+            // too little jerk.
             sum += adjusted.covariance.variance_held(&terms);
         }
     }

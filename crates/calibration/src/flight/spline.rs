@@ -39,6 +39,7 @@ impl TrajectorySpline {
     /// of [`IN_A_STEP`] coefficients.
     pub(super) fn over(start_s: f64, end_s: f64) -> Self {
         let intervals = ((end_s - start_s) / KNOT_S).ceil().max(1.0) as usize;
+        // n intervals of a cubic have n + 3 coefficients.
         let coefficients = (intervals + SPAN - 1).next_multiple_of(IN_A_STEP).max(2 * IN_A_STEP);
         Self { start_s, coefficients: vec![Vector3::zeros(); coefficients] }
     }

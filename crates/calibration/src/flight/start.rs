@@ -100,11 +100,13 @@ pub(super) fn among_others(
             labels = pieces.iter().filter(near).flatten().copied().collect();
             found = refined(found, &rays(camera, &labels), course, frame_s)?;
         }
+        // Where even the joined pieces do not fit, the first piece was of another thing.
         (found.misfit < NEARER_RAD).then_some(labels)
     });
     let own = of_labels(camera, ones.max_by_key(Vec::len)?);
     let is_own = |label: &Label| at_once(&own.labels, label.time_s, 0.5 * frame_s);
     let left_out = camera.labels.len() - own.labels.len();
+    // Labels of other things in frames that show the target too.
     let at_once = camera.labels.iter().filter(|label| is_own(label)).count() - own.labels.len();
     (at_once as f64 > AT_ONCE * left_out as f64).then_some(own)
 }
@@ -143,6 +145,7 @@ fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<C
     let mut found: Vec<CandidateStart> =
         offsets(some, course)?.flat_map(|offset_s| candidates(some, course, offset_s)).collect();
     found.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
+    // A robust solution costs several plain ones: only the best offsets get it.
     let cleaned = found.iter().take(CLEANED).filter_map(|one| cleaned(some, course, one.offset_s));
     let cleaned: Vec<CandidateStart> = cleaned.collect();
     found.extend(cleaned);
@@ -156,6 +159,7 @@ fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<C
 fn offsets(rays: &[Ray], course: &Course) -> Option<impl Iterator<Item = f64> + use<>> {
     let (first, last) = (rays.first()?.time_s, rays.last()?.time_s);
     let (from, to) = course.range();
+    // From the last ray at the course's beginning to the first one at its end.
     let count = ((to - from + last - first) / STEP_S) as usize;
     Some((0..=count).map(move |k| from - last + k as f64 * STEP_S))
 }
@@ -174,6 +178,7 @@ pub(super) fn state(
         reference_s: f64::midpoint(start, end),
         offset_s,
         rate: 0.0,
+        // The middle of the prior (`READOUT_SHARE`).
         readout_s: frame_time(camera) / 2.0,
         wander: course.way.drift(),
     };
@@ -235,6 +240,7 @@ fn seen_at(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Vec<Direction
         Some((ray.direction, course.way.place(&weights)))
     };
     let pairs: Vec<DirectionToPlace> = rays.iter().filter_map(at).collect();
+    // Otherwise an offset that leaves a few rays within the log would always fit best.
     let enough = LEAST_TRIED.max((LEAST_SHARE * rays.len() as f64) as usize);
     (pairs.len() >= enough).then_some(pairs)
 }
@@ -286,6 +292,7 @@ fn refined(
     let mut best: Option<CandidateStart> = None;
     let mut now = start;
     for _ in 0..STEPS {
+        // The weights sharpen as the fit improves: what is far off by then pulls less and less.
         let scale = now.misfit.max(1e-4);
         let mut normal = DMatrix::<f64>::zeros(7, 7);
         let mut right = nalgebra::DVector::<f64>::zeros(7);
@@ -309,6 +316,7 @@ fn refined(
                 / range;
             let by_place = by_offset * now.rotation.matrix().transpose();
             let by_rotation = by_offset * offset.cross_matrix();
+            // d(residual) / d(offset) = d(residual) / d(place) v.
             let by_time = by_place * velocity;
             // Cauchy's weights, with the scale of the current misfit.
             let weight = (1.0 + residual.norm_squared() / (scale * scale)).recip();
@@ -331,6 +339,7 @@ fn refined(
             best = Some(now.clone());
         }
         let Some(step) = normal.cholesky().map(|factor| factor.solve(&right)) else { break };
+        // R <- R exp(d), about the camera's own axes.
         now.rotation *= Rotation3::new(step.fixed_rows::<3>(0).into_owned());
         now.centre += step.fixed_rows::<3>(3).into_owned();
         now.offset_s += step[6].clamp(-STEP_S, STEP_S);

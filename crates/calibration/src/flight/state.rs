@@ -87,6 +87,7 @@ impl FlightState {
         }
         let mut rest = &step[order.chain()..];
         for (index, camera) in next.cameras.iter_mut().enumerate() {
+            // After the chain: each camera's own unknowns, as many as its lens has.
             let (own, after) = rest.split_at(camera.own());
             camera.step(own);
             rest = after;

@@ -49,6 +49,7 @@ impl FlightState {
             let [Some(a), Some(b)] = found else { continue };
             let apart = self.cameras[b].centre - self.cameras[a].centre;
             let scale = distance.sd_m.recip();
+            // d|b - a| / db = (b - a) / |b - a|, and the opposite by a.
             let along = apart.normalize() * scale;
             let ends = [(starts[a], -1.0), (starts[b], 1.0)];
             let of_end = |(start, sign): (usize, f64)| {

@@ -128,6 +128,7 @@ fn seeds(things: &[Things<'_>], survey: &Survey) -> Vec<Joined> {
     let mut pairs: Vec<[usize; 2]> = (0..things.len())
         .flat_map(|first| (first + 1..things.len()).map(move |second| [first, second]))
         .collect();
+    // A pair is as good as the camera of it that followed something for the shorter time.
     let least = |pair: &[usize; 2]| pair.map(|camera| longest(&things[camera])).into_iter().min();
     pairs.sort_by_key(|pair| std::cmp::Reverse(least(pair)));
     pairs.truncate(PAIRS);
@@ -168,6 +169,8 @@ impl Joined {
     /// Extended by all pieces of the same target; `None` if too few labels are left.
     fn joined(mut self, things: &[Things<'_>], survey: &Survey) -> Option<Self> {
         for _ in 0..ROUNDS {
+            // First what does not fit the pose goes, then what does is added; then the pose is
+            // computed again.
             while self.leave_worst_out(things) {}
             while self.join_next(things) {}
             let counts = [0, 1].map(|side| things[self.cameras[side]].labels(&self.pieces[side]));
@@ -223,6 +226,8 @@ impl Joined {
         for side in [0, 1] {
             let of_camera = &things[self.cameras[side]];
             for (piece, seen) in of_camera.sights.iter().enumerate() {
+                // One thing is in one place at a time: a piece that was followed beside the
+                // target's is another's.
                 if self.pieces[side].contains(&piece) || !of_camera.is_beside(piece, &own[side]) {
                     continue;
                 }
@@ -251,6 +256,7 @@ impl Joined {
         let placed = [0, 1].map(|side| (&sights[side], &states[side]));
         let course = Course::of(&triangulation::log(&placed));
         let of_camera = |(index, things): (usize, &Things<'_>)| {
+            // The two have their pieces already; the others follow the course that these two give.
             let side = self.cameras.iter().position(|camera| *camera == index);
             side.map_or_else(|| things.along(course.as_ref()), |side| own[side].clone())
         };

@@ -68,6 +68,7 @@ impl FlightState {
         let first = errors.drift_sd_m.max(1e-9).recip();
         let next = first / (1.0 - kept * kept).sqrt();
         for (axis, bias) in self.bias.iter().enumerate() {
+            // The first value has the process' own deviation, so that the bias is stationary.
             let begin = (vec![(order.bias(0, axis), first)], bias.values[0] * first);
             sink.take(&[begin], Tails::Normal);
             for (k, pair) in bias.values.windows(2).enumerate() {

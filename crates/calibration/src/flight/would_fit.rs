@@ -157,6 +157,7 @@ fn stretched(map: &AffineMap) -> Option<WouldFit> {
     let inverse = square(&(map.matrix.transpose() * map.matrix))?;
     let lengths = inverse.map(|square| square.sqrt().recip());
     let [axis, one, other] = odd_one(lengths)?;
+    // Against the geometric mean of the other two: the scale of M is arbitrary.
     let times = lengths[axis] / (lengths[one] * lengths[other]).sqrt();
     let axis = [Axis::East, Axis::North, Axis::Up][axis];
     ((times - 1.0).abs() > LEAST_STRETCH).then_some(WouldFit::Stretched { axis, times })
@@ -168,6 +169,7 @@ fn zoomed(map: &AffineMap) -> Option<f64> {
     let [x, y, ahead] = square(&(map.matrix * map.matrix.transpose()))?;
     // M = s diag(f, f, 1) R gives M M' = s^2 diag(f^2, f^2, 1).
     let times = ((x * y).sqrt() / ahead).sqrt();
+    // Both image axes must be stretched alike: otherwise it is no focal length.
     let is_round = (x / y).ln().abs() < 2.0 * ALIKE;
     (is_round && (times - 1.0).abs() > LEAST_STRETCH).then_some(times)
 }
@@ -183,6 +185,7 @@ fn square(matrix: &Matrix3<f64>) -> Option<[f64; 3]> {
 
 /// The one of three that differs from the other two, which must be equal; its index comes first.
 fn odd_one(lengths: [f64; 3]) -> Option<[usize; 3]> {
+    // The pair that is most nearly equal leaves the odd one out.
     let apart = |[_, one, other]: [usize; 3]| (lengths[one] / lengths[other]).ln().abs();
     let orders = [[0, 1, 2], [1, 0, 2], [2, 0, 1]];
     let best = orders.into_iter().min_by(|a, b| apart(*a).total_cmp(&apart(*b)))?;

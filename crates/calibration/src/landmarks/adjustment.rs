@@ -32,6 +32,7 @@ pub(super) struct AdjustedCamera {
 impl AdjustedCamera {
     /// Whether another pose fits as well, and is a different one.
     pub(super) fn is_rivalled_by(&self, other: &Self) -> bool {
+        // Costs are squares of deviations: a difference of 9 is three deviations.
         if other.cost > self.cost + ALIKE {
             return false;
         }
@@ -53,6 +54,7 @@ impl AdjustedCamera {
         let lens = all.view((POSE, POSE), (count, count)).into_owned();
         // Regression of the pose on the lens: C(pose, lens) C(lens)^-1.
         let pose_by_lens = lens.clone().cholesky()?.solve(&tied.transpose()).transpose();
+        // C(pose | lens) = C(pose) - B C(lens, pose).
         let held = all.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
         let held = (&held + held.transpose()) * 0.5;
         let pose = Matrix6::from_column_slice(held.as_slice());
@@ -140,6 +142,7 @@ impl Scaled {
 
     fn inverse(&self) -> DMatrix<f64> {
         let unit = self.factor.inverse();
+        // A^-1 = D (D A D)^-1 D.
         DMatrix::from_fn(unit.nrows(), unit.ncols(), |i, j| {
             unit[(i, j)] * self.scale[i] * self.scale[j]
         })

@@ -273,6 +273,7 @@ fn result(picture: &LandmarkPicture, adjusted: &AdjustedCamera) -> Option<Landma
     ranges.sort_unstable_by(f64::total_cmp);
     // Two numbers per click; the lens's free parameters are balanced by as many from its file.
     let measured = 2 * picture.landmarks.len() + if picture.place.is_some() { 3 } else { 0 };
+    // P(chi^2 > cost), with the pose's six unknowns taken off the number of measurements.
     let chance = ChiSquared::new((measured - 6) as f64).ok()?.sf(adjusted.cost);
     Some(LandmarkResult {
         name: picture.camera.clone(),

@@ -78,6 +78,7 @@ fn places(picture: &LandmarkPicture, angle: f64) -> Vec<Point3<f64>> {
 /// Directions evenly spread over the sphere, along a golden-angle spiral.
 fn spiral(k: usize) -> Unit<Vector3<f64>> {
     let golden = std::f64::consts::PI * (3.0 - 5.0f64.sqrt());
+    // Equal steps of the height are equal areas of the sphere.
     let up = 1.0 - (2.0 * k as f64 + 1.0) / DIRECTIONS as f64;
     let (sin, cos) = (golden * k as f64).sin_cos();
     let across = (1.0 - up * up).sqrt();

@@ -43,5 +43,6 @@ pub(crate) fn view_sr(known: &KnownCamera) -> f64 {
     let lens = known.camera.model().intrinsics();
     let [width, height] = [lens.size.width, lens.size.height].map(f64::from);
     // Whatever a calibration says, no camera sees more than all directions or less than a point.
+    // A pixel about the optical axis covers 1 / (fx fy) sr.
     ((width / lens.fx) * (height / lens.fy)).clamp(LEAST_VIEW_SR, 4.0 * PI)
 }

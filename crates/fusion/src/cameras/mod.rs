@@ -185,6 +185,8 @@ impl CameraState {
             self.told_clock = Some(now);
             return Some(ClockChange { ahead: 0.0, ratio: ANOTHER_CLOCK });
         }
+        // In units of the deviation that the tracks know: variance ratio q, and a = change of
+        // offset / sd.
         let ratio = (now.sd_s / told.sd_s).powi(2);
         let ahead = (now.offset_s - told.offset_s) / told.sd_s;
         let known = told.sd_s > RIGHT_CLOCK_S && now.sd_s > RIGHT_CLOCK_S;
@@ -336,6 +338,8 @@ impl Cameras {
         // By targets that only two others see nobody is accused, but the camera's clock may be
         // wrong.
         let misfits = camera.misfits.review() == Some(CameraStanding::Excluded);
+        // After `learn`, which renews the time of the last comparison: only an exposure that says
+        // nothing lets a verdict lapse.
         let lapsed = camera.standing.lapse(time).then_some(CameraStanding::Good);
         let standing = camera.standing.review().or(lapsed);
         let excluded = standing == Some(CameraStanding::Excluded);

@@ -86,6 +86,7 @@ impl WhiteNoise {
     /// where it is less: a reported covariance also covers errors that last longer than four
     /// pictures.
     pub(crate) fn factor(&self) -> f64 {
+        // ln f > DOUBT standard errors, each ERROR_OF_ONE / sqrt(n).
         let is_clear = self.log_factor * self.draws.sqrt() > DOUBT * ERROR_OF_ONE;
         if is_clear { self.log_factor.exp() } else { 1.0 }
     }

@@ -31,6 +31,7 @@ impl Pointed {
     /// Reads the pointing of a frame; `None` if it is impossible.
     pub(crate) fn read(message: &Pointing) -> Option<Self> {
         let angles = message.angles()?;
+        // An azimuth error a turns the direction by a cos(elevation).
         let sd_rad = (message.azimuth_sd * angles.elevation.cos()).max(message.elevation_sd);
         let possible = |sd: f64| (0.0..WORST_SD_RAD).contains(&sd);
         let both = possible(message.azimuth_sd) && possible(message.elevation_sd);

@@ -120,6 +120,7 @@ impl PoseScale {
         self.expected += (expected - self.expected) * share;
         // Minorisation-maximisation step of a variance: factor * sqrt(found / expected).
         let step = (self.found / self.expected).sqrt().clamp(LARGEST_STEP.recip(), LARGEST_STEP);
+        // Two cameras can clear each other, but not accuse.
         let most = if accusers < LEAST_ACCUSERS { 1.0 } else { LARGEST_STEP };
         let own = self.value * step.min(most);
         let next = own + (typical - own) * ALIKE;
@@ -164,6 +165,7 @@ impl Cameras {
         let mut logarithms: Vec<f64> = samples.iter().filter_map(logarithm).collect();
         logarithms.sort_unstable_by(f64::total_cmp);
         let middle = |k: usize| logarithms.get(k).copied().unwrap_or(0.0);
+        // Median of the logarithms; of an even number, the mean of the middle two.
         ((middle(logarithms.len() / 2) + middle(logarithms.len().saturating_sub(1) / 2)) / 2.0)
             .exp()
     }

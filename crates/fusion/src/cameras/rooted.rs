@@ -97,6 +97,7 @@ impl ReportedPlaces {
         let rooted_s = self.rooted_s;
         // What is there when a camera begins to look may have been there for long.
         let may_be_old = |first: Timestamp| first.seconds_since(began) < BEGINNING * rooted_s;
+        // Chord between unit vectors: at these angles, the angle itself.
         let distance = |place: &ReportedPlace| {
             (place.middle.into_inner() - line.direction.into_inner()).norm_squared()
         };
@@ -118,6 +119,8 @@ impl ReportedPlaces {
             });
             return if may_be_old(time) { Rooted::Unknown } else { Rooted::No };
         };
+        // Exponential mean in time, by its first-order share T / tau: many reports in a moment move
+        // the middle no faster.
         let share = (time.seconds_since(place.last).max(0.0) / (MIDDLE * rooted_s)).min(1.0);
         let moved = (line.direction.into_inner() - place.middle.into_inner()) * share;
         place.middle = Unit::new_normalize(place.middle.into_inner() + moved);

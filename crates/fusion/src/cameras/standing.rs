@@ -135,6 +135,7 @@ impl Standing {
     pub(super) fn review(&mut self) -> Option<CameraStanding> {
         let evidence =
             self.0.as_mut().filter(|evidence| evidence.compared_s >= LEAST_EVIDENCE_S)?;
+        // Hysteresis: two limits, so that a camera between them does not come and go.
         let limit = if evidence.excluded { RETURN } else { EXCLUSION };
         let excluded = evidence.wrong > limit;
         let changed = excluded != evidence.excluded;

@@ -173,6 +173,8 @@ impl Watched {
     /// Derivative of a line by the errors.
     fn by_errors(&self, sample: &ScaleSample) -> SMatrix<f64, 2, ERRORS> {
         let mut by = SMatrix::<f64, 2, ERRORS>::zeros();
+        // In units of the declared deviations: a pose error L s, with C = L L' and s of unit
+        // variance.
         by.fixed_columns_mut::<6>(0).copy_from(&(sample.by_pose * self.root));
         by.set_column(CLOCK, &sample.clock);
         by
@@ -181,6 +183,7 @@ impl Watched {
     /// Inverse covariance of its errors if it has been knocked by `knock_rad`, rad.
     fn knocked(&self, knock_rad: f64) -> Option<SMatrix<f64, ERRORS, ERRORS>> {
         let mut wide = self.covariance;
+        // A knock turns the camera and leaves it in its place.
         (0..3).for_each(|axis| wide[(axis, axis)] += knock_rad.powi(2));
         let mut inverse = SMatrix::<f64, ERRORS, ERRORS>::identity();
         // In units of the declared deviations: L' C^-1 L.
@@ -219,6 +222,7 @@ impl Watched {
         covariance: &SMatrix<f64, ERRORS, ERRORS>,
     ) -> Option<PoseFinding> {
         let prior = self.knocked(knock_rad)?;
+        // C^-1 = I + information of the lines, the other cameras' errors marginalised.
         let known = covariance.cholesky()?.inverse();
         // The posterior with the wide prior in place of the narrow one, which has unit variance.
         let wide = (known - SMatrix::identity() + prior).cholesky()?;
@@ -234,6 +238,7 @@ impl Watched {
             - log_determinant(&wide.l())
             + (known * mean).dot(&(moved - mean)))
             / 2.0;
+        // L is lower triangular: the rotation's rows have this block only.
         let turns = self.root.fixed_view::<3, 3>(0, 0);
         let spread: Matrix3<f64> =
             turns * wide.inverse().fixed_view::<3, 3>(0, 0) * turns.transpose();
@@ -306,6 +311,8 @@ impl ErrorWatch {
         // Weights by noise alone, and by noise and the errors that poses may have.
         let weights = samples.iter().map(|sample| sample.slow_noise.try_inverse());
         let weights: Vec<_> = weights.collect::<Option<_>>()?;
+        // The misfit is judged with the pose errors allowed: a camera that is off is no reason to
+        // doubt the target.
         let loose = samples
             .iter()
             .zip(&by_errors)
@@ -355,6 +362,7 @@ impl ErrorWatch {
         });
         let mut found: BTreeMap<CameraName, PoseFinding> = found.collect();
         let most = found.values().map(|own| own.log_odds).fold(f64::NEG_INFINITY, f64::max);
+        // Every camera that explains the lines nearly as well as the likeliest one stays a suspect.
         let likely = |own: &PoseFinding| own.log_odds > SURE && own.log_odds > most - DISTINCT;
         let suspects: Vec<CameraName> =
             found.iter().filter(|(_, own)| likely(own)).map(|(name, _)| name.clone()).collect();

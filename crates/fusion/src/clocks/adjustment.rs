@@ -40,6 +40,7 @@ impl Loss {
     fn of(self, squared: f64) -> (f64, f64) {
         match self {
             Self::Huber if squared > HUBER => {
+                // rho(q) = 2 sqrt(H q) - H, w = rho' = sqrt(H / q).
                 (2.0 * (HUBER * squared).sqrt() - HUBER, (HUBER / squared).sqrt())
             }
             Self::Trimmed if squared > OUTLIER => (OUTLIER, 0.0),
@@ -134,6 +135,8 @@ impl<'a> Adjustment<'a> {
 
     /// Fits trajectory, clocks and poses. `None` if the numbers fail.
     pub(super) fn solve(mut self, density: i32) -> Option<AdjustedCameras> {
+        // Huber's loss still draws the far ones in, while all may be far off; the trimmed one, from
+        // then on, lets strangers go.
         let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
         self.rescale(&state, Loss::Huber);
         let (mut state, mut density, mut evidence) = self.best_density(state, density)?;
@@ -174,6 +177,7 @@ impl<'a> Adjustment<'a> {
             };
             // Up to three standard errors (of the median; four of the mean) above 1 are chance for a camera whose covariances are
             // right: there the factor stays 1.
+            // The squares were taken with the factor so far.
             let found = typical * *scale;
             let next = if found < 1.0 + 4.0 / count.sqrt() { 1.0 } else { found };
             changed |= (next / *scale - 1.0).abs() > 0.1;
@@ -234,6 +238,7 @@ impl<'a> Adjustment<'a> {
     fn target(&self, sight: &WindowBearing, state: &WindowState) -> PredictedTarget {
         let (time_s, since) = self.time(sight, &state.cameras);
         let basis = self.curve.basis(time_s);
+        // p(t - o - d t'): dp/do = -v, dp/dd = -v t', with t' the time since the epoch.
         let (mut place, velocity) = basis.at(&state.coefficients);
         let Unknowns { clock, pose } = self.prior.cameras[sight.camera];
         let mut shifts = [(0, Vector3::zeros()); 8];
@@ -250,6 +255,7 @@ impl<'a> Adjustment<'a> {
             let away = place - sight.line.origin.coords;
             for axis in 0..3 {
                 let unit = Vector3::ith(axis, 1.0);
+                // d (x) away = sum over the axes of d_i (e_i x away), to first order in the turn.
                 let turned = unit.cross(&away);
                 add(first + axis, turned);
                 add(first + 3 + axis, unit);
@@ -272,6 +278,8 @@ impl<'a> Adjustment<'a> {
                 else {
                     break;
                 };
+                // It climbs one way only, as long as the evidence grows: a second maximum is not
+                // looked for.
                 if evidence <= best.2 {
                     break;
                 }
@@ -294,6 +302,7 @@ impl<'a> Adjustment<'a> {
         let log_determinant = 2.0 * factor.l_dirty().diagonal().map(f64::ln).sum();
         let before = self.prior.precision.clone().cholesky()?;
         let log_before: f64 = 2.0 * before.l_dirty().diagonal().map(f64::ln).sum();
+        // ln det(s R) = 2 ln s + ln det R for the two coordinates of a bearing.
         let scales =
             self.sights.iter().map(|sight| 2.0 * self.scales[sight.camera].ln()).sum::<f64>();
         let width = self.curve.log_width(jerk(density));
@@ -360,6 +369,7 @@ impl<'a> Adjustment<'a> {
             let (cost, weight) = loss.of(seen.squared);
             quadratic.cost += cost;
             if weight > 0.0 {
+                // g += w J' R^-1 z and A += w J' R^-1 J.
                 quadratic.add(&target, state.coefficients.len(), &seen, weight);
             }
         }

@@ -89,6 +89,8 @@ impl Belief {
         let others: Vec<usize> = self.clock_places().collect();
         let place = reference.map(|_| self.grow(2));
         if let (Some(reference), Some(place)) = (reference, place) {
+            // Relative to the reference r, the offset o_k - o_r has the variance v_k + v_r, and v_r
+            // in common with every other.
             let own = [prior + OFFSET_FLOOR_S.powi(2), drift_prior + DRIFT_FLOOR.powi(2)];
             for (i, common) in [reference.prior, reference.drift_prior].into_iter().enumerate() {
                 // The reference's own error is part of every offset from it.
@@ -188,6 +190,7 @@ impl Belief {
         for &k in &clocks {
             self.mean[k] += dt * self.mean[k + 1];
             let (mut offset, drift) = self.covariance.columns_range_pair_mut(k, k + 1);
+            // Columns first, P F', then rows, F (P F').
             offset.axpy(dt, &drift, 1.0);
         }
         for &k in &clocks {
@@ -352,6 +355,8 @@ impl Belief {
             clock.drift_prior + reference.drift_prior + DRIFT_FLOOR.powi(2),
         ];
         for (i, variance) in variances.into_iter().enumerate() {
+            // At true time again: relative to the reference that is minus the reference's own
+            // offset.
             self.mean[place + i] = -common[i];
             self.covariance.row_mut(place + i).fill(0.0);
             self.covariance.column_mut(place + i).fill(0.0);
@@ -463,6 +468,7 @@ impl Belief {
     pub(super) fn largest_offset(&self, time: Timestamp) -> f64 {
         let ahead = self.ahead(time);
         let offset = |clock: &ClockEntry| self.relative(clock, 0, ahead);
+        // Relative to the common time an offset is x_k - sum share x + site, as in `absolute`.
         let common = self.shares().map(|(clock, share)| share * offset(clock)).sum::<f64>()
             - (self.site[0] + self.site[1] * ahead);
         self.cameras
@@ -476,6 +482,8 @@ impl Belief {
     fn reference_offset_and_drift(&self) -> [f64; 2] {
         std::array::from_fn(|i| {
             let common = self.shares().map(|(clock, share)| share * self.relative(clock, i, 0.0));
+            // Common time = sum of share_k x_k, relative to the reference; the reference itself is
+            // at minus that.
             self.site[i] - common.sum::<f64>()
         })
     }

@@ -47,6 +47,7 @@ impl ClockReading {
         // Posterior odds of a liar, L / (1 - L) N(off; V) / N(off; R), of liar's and reported
         // variance.
         let odds = LIARS / (1.0 - LIARS) * (self.variance / liars).sqrt();
+        // P(as reported | off) = 1 / (1 + odds).
         let honest =
             (1.0 + odds * (off.powi(2) * (1.0 / self.variance - 1.0 / liars) / 2.0).exp()).recip();
         // The reciprocal of the expected precision.
@@ -104,6 +105,7 @@ fn climb(clocks: &[ClockReading], order: &[usize], start: f64) -> Maximum {
     for _ in 0..STEPS {
         // E step: the precision believed of each clock. M step: the mean weighted by it.
         shares = clocks.iter().map(|clock| clock.believed(clock.offset - offset).recip()).collect();
+        // 1 / sigma^2 = sum of precisions; each share is its precision times sigma^2.
         variance = order.iter().map(|&i| shares[i]).sum::<f64>().recip();
         shares.iter_mut().for_each(|share| *share *= variance);
         offset = order.iter().map(|&i| shares[i] * clocks[i].offset).sum();

@@ -87,6 +87,8 @@ impl Curve {
     /// The jerk density's part of the evidence: minus twice the log density of the prior, up to
     /// what is the same for all.
     pub(super) fn log_width(&self, jerk_density: f64) -> f64 {
+        // Each third difference has three axes of variance q h^5: ln det of them all, less what q
+        // does not change.
         3.0 * (self.points() - THIRD.len() + 1) as f64 * jerk_density.ln()
     }
 

@@ -156,6 +156,7 @@ impl ClockEstimator {
         if !self.config.estimate {
             return;
         }
+        // sd of a random walk of density w after t: sqrt(w t).
         let walks = (reported.clock_walk * WALK_S).sqrt();
         let uncertain = reported_sd_s.max(walks) >= self.config.least_sd_s
             && !self.config.trusted.contains(camera);
@@ -320,6 +321,7 @@ impl ClockEstimator {
     fn is_wanted(&self, camera: &CameraName, index: usize) -> bool {
         let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
         let sd = self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
+        // The worst half first: a window holds few cameras.
         let is_bad = self.is_suspected(camera) || sd > SURE_S.max(self.worst_sd_s / 2.0);
         is_bad && !others().any(|(_, window)| window.cameras.contains(camera))
     }
@@ -399,6 +401,7 @@ impl ClockEstimator {
             reported.cleared = round.cleared.contains(camera);
         }
         self.provisional = round.belief;
+        // Soon again while a clock that is in use is not well known.
         let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
         self.next_look = self.now.plus_seconds(pause);
     }

@@ -93,6 +93,7 @@ impl JumpTest<'_> {
             else {
                 continue;
             };
+            // The prior probability of a jump, as a price on the evidence.
             // Evidence of bearings that repeat one another is overstated as their information is. A
             // clock that is free fits their errors too, and hides that they repeat.
             let inflation = adjusted.inflation.max(without_jump);
@@ -137,6 +138,8 @@ impl JumpTest<'_> {
         let mut doubting = self.belief.clone();
         doubting.doubt_jumped(camera);
         let after = adjust(&doubting, &later, &self.components).filter(fits)?;
+        // Both must hold: the later half fits better without the earlier one, and it does not fit
+        // as well with the clock as it was.
         let much_better = plain.is_none_or(|plain| strange(&after) * BETTER < strange(plain));
         let before = adjust(&self.belief, &later, &self.components).filter(fits);
         // Where nothing was known of the clock yet, the evidences are even: nothing favours the old
@@ -179,6 +182,7 @@ fn fits(adjusted: &AdjustedCameras) -> bool {
 
 fn is_suspicious(adjusted: &AdjustedCameras) -> bool {
     adjusted.scales.iter().any(|scale| *scale > SUSPICIOUS_SCALE)
+        // In the mean a right prior is pulled by one per unknown at most.
         || adjusted.pulled > SUSPICIOUS_PULL * adjusted.cameras.len() as f64
 }
 

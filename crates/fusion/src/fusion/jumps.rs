@@ -84,6 +84,7 @@ impl Fusion {
     /// it.
     fn has_stepped(&self, frames: &[BearingFrame], step_s: f64) -> bool {
         let fit = |ahead_s: f64| -> f64 {
+            // Sum of the log-likelihood ratios, with `ahead_s` taken off the frames' times.
             frames.iter().filter_map(|frame| self.fit_of_frame(&moved(frame, -ahead_s))).sum()
         };
         step_s < 0.0 || (step_s < LONGEST_FORWARD_S && fit(step_s) > fit(0.0) + STEP_MARGIN)

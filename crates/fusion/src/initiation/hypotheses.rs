@@ -169,6 +169,8 @@ impl Hypotheses {
     /// Continues every hypothesis with each bearing in its gate, and without any.
     fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &MotionSetup) {
         let lines: Vec<NamedLine> = lines_of(exposure).collect();
+        // The velocity of a hypothesis is hardly known, and so neither is the shift by the clock's
+        // error.
         let uncertainty = CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty };
         let detection = self.tracking.detection_probability;
         let before = self.exposed.insert(exposure.camera.clone(), exposure.time);
@@ -223,6 +225,7 @@ impl Hypotheses {
         };
         let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
         near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        // The likeliest continuation, with a bearing or without.
         let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
         near.retain(|(ratio, _)| *ratio > miss && *ratio > best - RIVAL_MARGIN);
         near.truncate(MAX_BRANCHES);
@@ -234,6 +237,7 @@ impl Hypotheses {
             return;
         }
         if expected {
+            // ln(1 - P(visible) P_D); against one target per camera, ln(1 - P_D) alone.
             hypothesis.track.score += miss;
             hypothesis.track.look(&exposure.camera, exposure.time, false, detection, motion);
             hypothesis.one_target.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
@@ -252,6 +256,7 @@ impl Hypotheses {
         let HypothesisContext { exposure, motion, lines, uncertainty, detection, .. } = *context;
         let (id, line) = &lines[i];
         let time = (exposure.time, &uncertainty);
+        // Taken before the update, as the prediction that the bearing is compared with.
         let density = motion.density(hypothesis.track.model_probabilities());
         hypothesis.track.measurement_update(&exposure.camera, &line.line, time, motion)?;
         hypothesis.track.score += ratio;
@@ -276,6 +281,7 @@ impl Hypotheses {
         self.hypotheses.retain(|h| {
             let (best, count) = trees.entry(h.tree).or_insert((h.track.score, 0));
             *count += 1;
+            // Sorted by score: the first of a tree is its best.
             *count <= MAX_FAMILY
                 && h.track.score > *best - FAMILY_MARGIN
                 && h.track.score > LEAST_SCORE
@@ -431,5 +437,6 @@ fn logarithm_of_pairs(exposures: &[&Exposure]) -> f64 {
     }
     let mut counts: Vec<usize> = lines.into_values().collect();
     counts.sort_unstable();
+    // ln(n1 n2), n1 and n2 the two largest counts.
     counts.iter().rev().take(2).map(|&count| (count.max(1) as f64).ln()).sum()
 }

@@ -146,11 +146,14 @@ pub(crate) fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> +
 pub(crate) fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     let pose = exposure.uncertainty.pose;
     let origin_sd_m = pose.map_or(0.0, |pose| {
+        // Mean over the axes, in metres: only with a range does it become an angle.
         (pose.covariance().fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt()
     });
     lines_of(exposure).map(move |(id, mut timed)| {
         let line = &mut timed.line;
         let at_infinity =
+            // At infinite range only the rotation shifts the line; the position's part is
+            // `origin_sd_m`.
             BearingModel { direction: line.direction, basis: line.basis, range: f64::INFINITY };
         line.covariance *= exposure.uncertainty.factor;
         line.covariance += exposure.uncertainty.shared(&at_infinity, Vector3::zeros());

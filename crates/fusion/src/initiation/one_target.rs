@@ -42,6 +42,7 @@ impl OneTargetTest {
         log_ratio: f64,
     ) -> Self {
         let sight = |(camera, line, time): (&CameraName, &SightLine, Timestamp)| {
+            // A speed of v across the line turns it at v / r.
             let range = (place - line.origin).norm();
             (camera.clone(), DirectionFilter::first(line, time, speed / range))
         };
@@ -111,6 +112,7 @@ impl OneTargetTest {
         sight.predict(time, density / range.powi(2));
         self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
         // The shift by an uncertain clock is not known before the velocity is: use a typical speed.
+        // Var = (v sd(t) / r)^2 per tangent.
         let clock = (speed * TYPICAL_SPEED * time_sd_s / range).powi(2);
         self.inconclusive |= clock > INCONCLUSIVE * line.covariance.trace() / 2.0;
         sight.update(line);
@@ -122,6 +124,7 @@ impl OneTargetTest {
         if self.sights.iter().any(|(name, _)| name == camera) {
             return;
         }
+        // Exposures close together count as one look.
         let more = log_miss * independent_share(interval_s);
         match self.silent.iter_mut().find(|(name, _)| name == camera) {
             Some((_, log)) => *log = (*log + more).max(LOG_NEVER_DETECTED),

@@ -82,6 +82,8 @@ impl Periods {
         while self.spreads.len() > 2 * self.heard.len() {
             self.spreads.pop_front();
         }
+        // The smallest spread of the last two rounds: a period may close where it comes that small
+        // again.
         let closest = self.spreads.iter().copied().fold(f64::INFINITY, f64::min);
         let (unused, heard) = (&mut self.unused, &self.heard);
         unused.retain(|camera, _| heard.contains_key(camera));

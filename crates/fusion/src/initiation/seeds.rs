@@ -107,6 +107,7 @@ impl SeedFinder {
                     tried += 1;
                     let enough =
                         tried > MAX_PAIRS || close > MAX_CLOSE_PAIRS || seeds.len() > MAX_FOUND;
+                    // A line on which four cameras agree needs no other set.
                     if settled[a][i] || settled[b][j] || enough {
                         continue;
                     }
@@ -174,6 +175,8 @@ impl SeedFinder {
                     let axis = |pose: &crossfix_geometry::Pose| {
                         pose.rotation().matrix().column(2).into_owned()
                     };
+                    // |a x b| = sin of the angle between the optical axes: the range's deviation
+                    // goes with 1 / sin.
                     pairs.push((axis(one).cross(&axis(other)).norm(), (a, b)));
                 }
             }
@@ -212,6 +215,8 @@ impl SeedFinder {
                     }
                 }
                 // Until the sets have branched, the camera may also have missed the target.
+                // After the first branching only the nearest line of each camera is tried: the
+                // number of sets grows no further.
                 if !branched || near.is_empty() || next.is_empty() {
                     next.push((places, solution));
                 }
@@ -294,6 +299,7 @@ impl SeedFinder {
         if !(lines.iter().all(in_range) && self.agrees(&solution, lines.len())) {
             return None;
         }
+        // Cameras that should have seen it and have no line of it: each counts ln(1 - P_D).
         let silent = growing.exposures.iter().enumerate().filter(|(k, exposure)| {
             let missed = places.iter().all(|(camera, _)| camera != k);
             missed

@@ -85,6 +85,8 @@ impl Selection {
         let others: Vec<usize> = self.neighbours(chosen).filter(|&i| !alike(i)).collect();
         let mut without = self.chosen.clone();
         without.remove(&chosen);
+        // Without the leaf, others that clash with it may take its lines: only the difference is
+        // lost.
         let gained: f64 =
             self.additions(&without, &others).iter().map(|&i| self.leaves[i].score).sum();
         // If there was no time to look for alternatives, nothing is sure.
@@ -106,6 +108,7 @@ impl Selection {
 
     fn fits(&self, leaf: usize, choice: &BTreeSet<usize>) -> bool {
         let lines = &self.leaves[leaf].lines;
+        // What the test below costs at most: one comparison per user of each of its lines.
         let cost = lines.iter().map(|&line| self.users[line].len()).sum();
         let left = self.budget.get().checked_sub(cost);
         self.budget.set(left.unwrap_or(0));
@@ -113,6 +116,7 @@ impl Selection {
             return false;
         }
         let near = lines.iter().flat_map(|&line| &self.users[line]);
+        // Only leaves that use one of its lines can clash with it.
         near.filter(|i| choice.contains(i)).all(|&i| i != leaf && !self.clash(leaf, i))
     }
 
@@ -153,6 +157,8 @@ impl Selection {
                 if self.budget.get() < MAX_COMPARISONS / 2 {
                     return;
                 }
+                // Better by more than rounding: otherwise two sets of one score would be exchanged
+                // for ever.
                 if gained > self.leaves[out].score + 1e-9 {
                     self.chosen = without;
                     self.chosen.extend(added);

@@ -93,6 +93,7 @@ impl DirectionFilter {
         prediction: &BearingPrediction,
     ) -> Option<f64> {
         let to_tangents = prediction.basis().transpose();
+        // The line's covariance is on its own tangents; here all is on those of the prediction.
         let turn = to_tangents * line.basis;
         let own = turn * line.covariance * turn.transpose() * self.factor();
         let seen = to_tangents * line.direction.into_inner();
@@ -125,6 +126,7 @@ impl DirectionFilter {
     pub(super) fn update(&mut self, line: &SightLine) {
         let reported = line.covariance.trace() / 2.0;
         let off = line.direction.into_inner() - self.direction.into_inner();
+        // z' z / S, with S by the reported noise: 2 is expected of two coordinates.
         self.squares += off.norm_squared() / (self.variance + reported);
         self.coordinates += 2.0;
         // Kalman update of the two states direction and rate by the direction alone, with the gains

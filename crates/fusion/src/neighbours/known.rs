@@ -32,6 +32,7 @@ impl PastPlaces {
         self.newest = Some((time, state.clone()));
         match self.kept.back().map(|(last, _)| time.seconds_since(*last)) {
             Some(since_s) if (0.0..KEPT_EVERY_S).contains(&since_s) => return,
+            // Time has gone back: what was kept is of times that are still to come.
             Some(since_s) if since_s < 0.0 => self.kept.clear(),
             _ => {}
         }

@@ -89,6 +89,8 @@ impl Likenesses {
         if !known.is_of_late(now) {
             *known = new;
         }
+        // Exponential mean to first order, m += (dt / T) (x - m); dt < T, as older ones begin
+        // again.
         let share = now.seconds_since(known.seen) / LONG_ENOUGH_S;
         known.distance += share * (distance - known.distance);
         known.cost += share * (cost - known.cost);
@@ -122,6 +124,7 @@ impl Likenesses {
         now: Timestamp,
     ) -> bool {
         let is_rival = |other: &TrackLikeness| {
+            // Costs are -2 ln L: a rival is one that is not less likely by the factor `CLEARLY`.
             other.is_of_late(now) && other.cost < likeness.cost + 2.0 * CLEARLY.ln()
         };
         let mut of_neighbour = self.of_own(own).filter(|(other, _)| other.0 == said.0);

@@ -295,6 +295,7 @@ impl Neighbours {
         let same = self.likenesses.same_as(own, now);
         let elder = same
             .filter_map(|said| Some((self.theirs.get(&said)?.born, said.1)))
+            // The eldest, and of two of one age the smaller number: both centres find the same.
             .min()
             .filter(|elder| *elder < (born, before) && is_free(elder.1))?;
         let ours = self.ours.get_mut(&own)?;
@@ -334,6 +335,7 @@ impl Neighbours {
                 // What the neighbour said before this centre began is why this one began. Where
                 // both began at once, one goes on.
                 let is_new = theirs.heard.is_some_and(|heard| heard > since);
+                // A tie is decided by the centres' order, which both know alike.
                 let yields = index < self.share.index && !grip.is_better_than(&theirs.grip);
                 is_new && (theirs.grip.is_better_than(&grip) || yields)
             }

@@ -78,6 +78,8 @@ impl FixFinder {
                     self.fix_at(&lines, one.1.time, Solver::Pair, VelocityKnowledge::Unknown)
                 {
                     fix.state.mean.fixed_rows_mut::<3>(0).copy_from(&solution.position.coords);
+                    // The paper's position, with the covariance of the weighted solution; the pair
+                    // knows no velocity.
                     fix.state.mean.fixed_rows_mut::<3>(3).fill(0.0);
                     fixes.push(PeriodFix { fix, lines });
                 }

@@ -111,6 +111,7 @@ impl Group {
             // v = sum of (t - mean) p / sum of (t - mean)^2.
             let weighted = positions().zip(&times).map(|(position, t)| position * (t - mean_time));
             let velocity = weighted.sum::<Vector3<f64>>() / spread;
+            // p(0) = mean p - v mean t, with times counted from the last fix.
             (Point3::from(mean - velocity * mean_time), velocity)
         })
     }
@@ -186,6 +187,7 @@ impl Grouping {
                     });
                 }
             }
+            // Pruned from time to time: the list stays bounded while it is made.
             if candidates.len() > 4 * MAX_GROUPS {
                 keep_best(&mut candidates);
             }

@@ -11,6 +11,7 @@ pub(super) fn typical_range(first: &TimedLine, others: &[&TimedLine]) -> f64 {
         .fold(0.0, f64::max);
     let along = |other: &TimedLine| first.line.direction.dot(&other.line.direction).abs();
     let elsewhere = others.iter().filter(|other| other.line.origin != first.line.origin);
+    // The least |cos| is the widest angle.
     let widest = elsewhere.min_by(|one, other| along(one).total_cmp(&along(other)));
     let solution = widest.and_then(|other| pair(first, other, Vector3::zeros()));
     let range = solution.map_or(base, |solution| solution.first_range.max(solution.second_range));

@@ -83,6 +83,8 @@ fn system(
     // shape is known only at run time (benches/solvers).
     let n = others.len() + 1;
     let unknowns = n + motion.unknowns();
+    // As many rows as unknowns at least: the SVD then has a singular value, 0 where need be, for
+    // each unknown.
     let rows = (3 * others.len()).max(unknowns);
     let mut a = Mat::<f64>::zeros(rows, unknowns);
     let mut b = Col::<f64>::zeros(rows);

@@ -50,6 +50,7 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
     // Of the system as it is, not of the scaled one.
     observability.condition_number = condition_number(&a);
 
+    // A regular system is solved as it is: the scales decide the rank and the pseudo-inverse alone.
     let x = if observability.is_full() {
         a.lu().solve(&b)?
     } else {

@@ -39,6 +39,8 @@ impl TimedLine {
     /// Covariance of the direction to a target at `range` whose velocity has a prior of
     /// `velocity_sd` (m/s per axis): the line's own, plus what its uncertain time and origin add.
     pub(crate) fn noise_at(&self, range: f64, velocity_sd: f64) -> Matrix2<f64> {
+        // Variance across the line, m^2, of clock and origin: (v sd(t))^2 + sd_c^2; over r^2 it is
+        // an angle's.
         let variance =
             (velocity_sd * TYPICAL_SPEED * self.time_sd_s).powi(2) + self.origin_sd_m.powi(2);
         self.line.covariance + Matrix2::identity() * (variance / range.powi(2))

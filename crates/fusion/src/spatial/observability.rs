@@ -116,6 +116,8 @@ impl Observability {
     ) -> Self {
         let [p, v] = [position_scale, velocity_scale];
         let scale = Matrix6::from_diagonal(&Vector6::new(p, p, p, v, v, v));
+        // D I D, D the prior scales: an eigenvalue is how many times better than its scale a
+        // combination is known, squared.
         let scaled = scale * information * scale;
         // The singular values of the scaled and whitened system, whose noise is 1.
         let singular = |eigenvalue: &f64| eigenvalue.max(0.0).sqrt();
@@ -132,5 +134,6 @@ impl Observability {
 
 /// Whether the data determine the direction of a singular value.
 pub(crate) fn determined(value: f64, noise: f64, largest: f64) -> bool {
+    // Beside the noise, rounding: what is 1e-12 of the largest is nothing.
     value > noise.max(largest * 1e-12)
 }

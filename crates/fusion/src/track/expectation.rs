@@ -63,6 +63,8 @@ impl Track {
     ) -> Option<TrackExpectation> {
         let interval = time.seconds_since(self.updated);
         let errors = self.errors_of(camera, interval);
+        // For the following camera itself the uncertain range moves no bearing: it has one
+        // direction.
         let follower = self.follower.filter(|follower| !self.held && *follower != origin);
         if let Some(seen_from) = follower {
             let state = self.predicted(time, motion);

@@ -41,6 +41,7 @@ impl Against<'_> {
             + cross.transpose()
             + errors.spread(&shifts)
             + model.covariance_of(self.line) * self.uncertainty.factor;
+        // z - J E(s).
         let offset = offset - shifts * errors.mean;
         let factor = spread.cholesky()?;
         Some((offset.dot(&factor.solve(&offset)), factor.determinant()))

@@ -68,10 +68,12 @@ impl Track {
         if let Some(row) = self.learnt.row_of(camera) {
             let kept = ties.kept(interval);
             let known = ties.learnt.fixed_rows::<2>(row);
+            // e decays towards 0, its mean before anything is known.
             let mean = self.learnt.means[row / 2] * kept;
             // First-order Gauss-Markov: e' = k e + noise, W' = k^2 W + (1 - k^2) I.
             let own = known.fixed_columns::<2>(LASTING) * kept.powi(2)
                 + Matrix2::identity() * (1.0 - kept.powi(2));
+            // cov(e', s) = k cov(e, s).
             let considered = known.fixed_columns::<CONSIDERED>(0) * kept;
             let covariance = &mut errors.covariance;
             covariance.fixed_view_mut::<2, 2>(LASTING, LASTING).copy_from(&own);
@@ -151,6 +153,7 @@ impl Track {
             ties.learnt = old.resize_vertically(count, 0.0);
             let mut own = ties.learnt.fixed_view_mut::<2, 2>(count - 2, LASTING);
             if name == camera {
+                // Own block: unit variance, as nothing is known of the new errors yet.
                 own.fill_with_identity();
             } else if let Some(row) = self.learnt.row_of(name) {
                 own.copy_from(&known.fixed_view::<2, 2>(row, LASTING).transpose());
@@ -250,6 +253,8 @@ impl Track {
             match self.learnt.row_of(name) {
                 None => ties.learnt -= &gain * seen,
                 Some(row) => {
+                    // This camera's own learnt errors: W <- W - A (S^-1 - spread) A', and X_e gains
+                    // the covariance of state and pull over the models.
                     let own = across.fixed_rows::<2>(row).transpose();
                     let mut considered = ties.learnt.fixed_columns_mut::<CONSIDERED>(0);
                     considered -= &gain * seen.fixed_columns::<CONSIDERED>(0);
@@ -302,6 +307,8 @@ impl Track {
             between.fixed_rows_mut::<2>(LASTING).copy_from(&ties.fixed_rows::<2>(row));
         }
         if let (Some(row), Some(ties)) = (self.learnt.row_of(other), of(one)) {
+            // Considered errors of two cameras are independent; only what is learnt ties them
+            // together.
             let rows = ties.fixed_rows::<2>(row).transpose();
             between.fixed_columns_mut::<2>(LASTING).copy_from(&rows);
         }
@@ -357,6 +364,7 @@ impl Track {
             parts.iter().sum()
         };
         let of_cameras = self.ties.iter().map(|(name, ties)| self.considered_part(name, ties));
+        // P >= sum of X_k X_k' for independent errors of unit variance.
         let considered = sum(of_cameras.collect());
         match self.learnt_part() {
             Some(learnt) => considered + learnt,
@@ -399,6 +407,7 @@ impl Track {
             tied -= ties.covariance * with.transpose();
             own -= &with * with.transpose();
         }
+        // With C = L L': T C^-1 T' = (L^-1 T')' (L^-1 T').
         let half = own.cholesky()?.l().solve_lower_triangular(&tied.transpose())?;
         Some((half.transpose() * half).fixed_view::<6, 6>(0, 0).into_owned())
     }

@@ -35,6 +35,7 @@ impl PastState {
     /// Carries `with_now` on to a later present time: the position moves with the velocity.
     fn pass(&mut self, to: Timestamp, interval: f64) {
         let velocity = self.with_now.fixed_rows::<3>(3).into_owned();
+        // N <- F N; the past state itself does not move.
         let mut position = self.with_now.fixed_rows_mut::<3>(0);
         position += velocity * interval;
         self.carried_to = to;
@@ -82,6 +83,7 @@ impl PastState {
             } else {
                 gain * by_errors
             };
+            // X_past <- X_past - A S^-1 cov(bearing, s), as for the state.
             *self.ties_to(camera) -= change;
         }
     }
@@ -103,6 +105,7 @@ impl PastState {
             Some(whole.symmetric_eigenvalues().max())
         });
         match largest.filter(|largest| largest.is_finite() && *largest > 0.0) {
+            // N enters the explained part squared: scaled by sqrt(c), that is scaled by c.
             Some(largest) => self.with_now *= (CLOSEST / largest).min(1.0).sqrt(),
             None => self.settle(),
         }
@@ -131,6 +134,7 @@ impl Track {
         let interval = time.seconds_since(self.updated);
         let ties =
             self.ties.iter().map(|(name, ties)| (name.clone(), ties.predicted(interval))).collect();
+        // At first the past state is the present one: N = P.
         let with_now = state.covariance;
         self.past.push_back(PastState {
             time,
@@ -245,6 +249,7 @@ impl Track {
             let own = ties.fixed_columns::<N>(first).into_owned();
             let mut columns = ties.fixed_columns_mut::<N>(first);
             columns *= scale;
+            // P += (q - 1) X X' and N += (q - 1) X_now X_past', as for the track's own state.
             let changed = past.state.covariance + own * own.transpose() * (ratio - 1.0);
             if changed.cholesky().is_some() {
                 past.state.covariance = changed;

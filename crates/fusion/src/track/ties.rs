@@ -129,6 +129,8 @@ impl Drawn {
             camera: camera.clone(),
             offset: self.offsets / self.count,
             by_position: self.by_position,
+            // The lasting part does not average out within a draw; for the watch, over many draws,
+            // it does as slowly as white noise of `as_white`.
             noise: white + Matrix2::identity() * self.lasting.variance(),
             pose: self.pose,
             by_pose: self.by_pose,
@@ -145,6 +147,7 @@ impl Ties {
         let beside = self.beside.take().filter(|_| self.drawn.is_none());
         let place = beside.map(|drawn| drawn.offsets / drawn.count);
         let (before, draws) = self.steady;
+        // The offset may change by a share of itself: what passes by changes it by more.
         let stays = place.is_some_and(|place| (place - before).norm() < STEADY * before.norm());
         self.steady =
             place.map_or((Vector2::zeros(), 0), |place| (place, if stays { draws + 1 } else { 0 }));
@@ -224,6 +227,7 @@ impl Ties {
     pub(super) fn predicted(&self, interval: f64) -> SharedTies {
         let mut covariance = self.covariance;
         let velocity = covariance.fixed_rows::<3>(3).into_owned();
+        // X <- F X exp(-t / T), the last factor in the columns of the lasting errors only.
         let mut position = covariance.fixed_rows_mut::<3>(0);
         position += velocity * interval;
         let mut lasting = covariance.fixed_columns_mut::<2>(LASTING);
@@ -318,6 +322,7 @@ impl Track {
         let Some(ties) = self.ties.get(camera) else {
             return;
         };
+        // x += a X: X is the covariance with an error of unit variance, found to be a.
         let moved = ties.covariance.column(OF_CLOCK) * ahead;
         self.imm.shift(&moved);
         self.shift_learnt(camera, OF_CLOCK, ahead);
@@ -368,11 +373,14 @@ impl Track {
         (time, interval): (Timestamp, f64),
         results: &[Option<Updated>],
     ) -> f64 {
+        // Weighted with the probabilities after the update; a model whose numbers failed has none.
         let models = results.iter().zip(self.imm.probabilities().iter().copied());
         let models = models.filter_map(|(result, weight)| Some((result.as_ref()?, weight)));
         let nis = models.clone().map(|(after, weight)| after.nis * weight).sum();
         let told = Told::over(models);
         self.note(camera, self.updated);
+        // First all is predicted, then updated; the past states first, as they need the ties before
+        // the update.
         self.pass_past(time);
         self.pass(interval);
         self.begin_to_learn(camera, lasting, time);
@@ -396,6 +404,8 @@ impl Track {
     /// Widens each model whose covariance is smaller than the ties allow: the ties are updated with
     /// the mean over the models, and a single model that is surer than that is not believed.
     pub(super) fn keep_ties_possible(&mut self) {
+        // P - X C^-1 X' is the covariance that is left once the errors are known: it cannot be
+        // negative.
         let shared = self.shared_part();
         if shared.amax() > 0.0 {
             self.imm.raise_to(&shared);

@@ -89,6 +89,8 @@ impl Tracker {
                 // No evidence for the target: what one camera alone follows may be anything along
                 // its sight line.
                 Some(_) if sure && !track.is_held() => 0.0,
+                // The gain was counted against a miss, ln(P_D N / clutter) - ln(1 - P_D): the score
+                // wants the first term alone.
                 Some(gain) => gain + missed,
                 // If whatever hides the target hides it from all cameras, a miss is no evidence
                 // against it; when nobody sees it, time decides.

@@ -142,6 +142,7 @@ impl Tracker {
         });
         if let Some(old) = same {
             track.id = old.id;
+            // The number goes on, and with it what spoke for the target.
             track.score = track.score.max(old.score);
             (track.has_ends, track.comparisons) = (old.has_ends, old.comparisons);
             if let Some(old) = self.tracks.get_mut(&track.id) {
@@ -188,6 +189,7 @@ fn is_one_image(old: &Track, new: &Track, time: Timestamp, cameras: &Cameras) ->
     let times = if old.has_ends { 2.0 } else { 1.0 };
     new.residuals.keys().all(|name| {
         cameras.known(name).is_some_and(|known| {
+            // px / fx is the angle about the optical axis.
             let smallest = SMALLEST_TARGET_PX / known.camera.model().intrinsics().fx;
             let origin = known.camera.pose().position();
             (there - origin).angle(&(here - origin)) < times * smallest

@@ -104,6 +104,7 @@ impl Candidate {
 
     /// Number of parts of the scene that it has been over.
     fn parts(&self) -> f64 {
+        // n = 1 + distance gone / size of a part, the second term bounded.
         1.0 + (self.gone_px / (PLACE_CELLS * self.plot.cell)).min(MOST_PLACES)
     }
 
@@ -115,8 +116,11 @@ impl Candidate {
         let persistence = f64::from(self.plot.persistence);
         // n images of noise with persistence p are worth n (1 - p) / (1 + p) independent ones.
         let looks = f64::from(self.plots) * (1.0 - persistence) / (1.0 + persistence);
+        // Variance of the mean excess, in spreads^2: noise averages out over the looks, texture
+        // over the parts of the scene.
         let noise = (1.0 / looks.max(1.0)).max(LEAST_NOISE);
         let texture = f64::from(self.plot.texture).powi(2) / self.parts();
+        // s / TAIL - ln s is least at s = TAIL, and would rise again below it.
         let standing = (self.mean_excess / (texture + noise).sqrt()).max(TAIL);
         // Strength s: a density uniform in ln s against the exponential tail of the scene's
         // changes.
@@ -158,11 +162,14 @@ impl Candidate {
         // ln (P_D N(innovation; 0, S) / clutter), with P_D the probability of a plot.
         let there = -0.5 * distance - (std::f64::consts::TAU * determinant.sqrt()).ln();
         let told = (MAKES_PLOT.ln() + there - chance.ln()).min(MOST_OF_PLOT);
+        // The bound grows by 1 with each further part of the scene, and is higher where noise does
+        // not last.
         self.motion_log_ratio = (self.motion_log_ratio + told).min(
             MOST_IN_PLACE + MOST_IN_NOISE * (1.0 - f64::from(plot.persistence)) + self.parts()
                 - 1.0,
         );
         self.plots += 1;
+        // Running mean: m_n = m_(n-1) + (e - m_(n-1)) / n.
         self.mean_excess += (f64::from(plot.excess) - self.mean_excess) / f64::from(self.plots);
         self.plot = plot;
         self.unseen_s = 0.0;
@@ -246,6 +253,7 @@ impl Candidates {
         let in_scene = |plot: &Plot| [plot.place.x + turned[0], plot.place.y + turned[1]];
         let gate = Gate::with_probability(IN_GATE);
         let mut is_free = vec![true; plots.len()];
+        // The likeliest candidates choose first: the list is sorted.
         for candidate in &mut self.list {
             candidate.axes.iter_mut().for_each(|axis| axis.time_update(interval));
             let near = plots
@@ -267,6 +275,7 @@ impl Candidates {
                     );
                 }
                 None => {
+                    // ln (1 - P_D).
                     candidate.motion_log_ratio += (1.0 - MAKES_PLOT).ln();
                     candidate.unseen_s += interval;
                 }

@@ -82,6 +82,7 @@ fn means_along(sums: &[f32], means: &mut [f32]) {
         share * places.map(|x| sums[x.saturating_sub(SURROUNDINGS).min(last)]).sum::<f32>()
     };
     let inner = sums.len().saturating_sub(SIDE - 1);
+    // At both ends the border column is repeated; between them the windows are whole.
     for x in (0..SURROUNDINGS.min(sums.len())).chain(SURROUNDINGS + inner..sums.len()) {
         means[x] = clamped(x);
     }
@@ -103,6 +104,7 @@ pub(super) fn resample(from: &Plane, by: [f32; 2], to: &mut Plane) {
             let blend = |x: usize| here[x] + across * (there[x] - here[x]);
             let out = to.row_mut(y);
             for (x, out) in out.iter_mut().enumerate().take(width - 1).skip(1) {
+                // Bilinear: first down the two columns, then along the row.
                 let (at, next) = (blend(x), blend(x.wrapping_add_signed(right)));
                 *out = at + along * (next - at);
             }

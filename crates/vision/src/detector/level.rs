@@ -184,11 +184,14 @@ impl Level {
     /// it has the same.
     pub(super) fn new_share(&self, [x, y]: [usize; 2]) -> f32 {
         let now = self.now.row(y)[x];
+        // (now - c mean) / now, with c the contrast of this image.
         if now == 0.0 { 0.0 } else { 1.0 - self.contrast * self.mean.row(y)[x] / now }
     }
 
     /// Least strength of something that is not noise, in spreads.
     pub(super) fn least_strength(&self) -> f32 {
+        // A mean over many images of noise with persistence p has (1 + p) / (1 - p) times the
+        // variance of a mean over independent ones.
         let lasting = (1.0 + self.persistence) / (1.0 - self.persistence).max(1e-3);
         LEAST_CHANGE * lasting.min(MOST_LASTING).sqrt()
     }
@@ -200,6 +203,7 @@ impl Level {
         self.scratch.clear();
         for down in (-reach..=reach).step_by(2) {
             for right in (-reach..=reach).step_by(2) {
+                // The inner half of the square is what the cell itself is compared with.
                 if right.abs().max(down.abs()) > reach / 2 {
                     self.scratch
                         .push(self.now.clamped(x as isize + right, y as isize + down).abs());
@@ -229,11 +233,14 @@ impl Level {
     /// Moves the background with the scene.
     fn turn(&mut self, Moment { turned, is_first, .. }: Moment) {
         let cells = turned.map(|turned| turned / self.cell as f64);
+        // The background moves by whole cells: interpolated at every turn it would be blurred more
+        // and more. The image is interpolated instead, by the rest, and only once.
         let whole = cells.map(|cells| cells.round() as isize);
         self.rest = [0, 1].map(|i| (cells[i] - whole[i] as f64) as f32);
         if self.rest == [0.0; 2] {
             std::mem::swap(&mut self.now, &mut self.stands_out);
         } else {
+            // The background's cell i lies at i - rest in the image's cells.
             resample(&self.stands_out, self.rest.map(|rest| -rest), &mut self.now);
         }
         let by = [0, 1].map(|i| whole[i] - self.whole[i]);
@@ -249,6 +256,7 @@ impl Level {
     /// Estimates the light, the noise and the sway from this image's changes.
     fn compare(&mut self, interval: f64, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
+        // An odd step: the samples do not all come from the same few columns.
         let step = (width * height / SAMPLES) | 1;
         // Contrast c: the median of now / mean over the cells that stand out.
         let cells = || self.mean.samples().iter().zip(self.now.samples()).step_by(step);
@@ -268,6 +276,8 @@ impl Level {
 
         // Sway: solve change^2 = sway slope^2 + usual variance, over the textured cells together.
         let (mut slopes, mut changes, mut told_by, mut changed) = (0.0_f32, 0.0_f32, 0, 0);
+        // Squared, in cells, from here on: a sway of variance w changes a cell of slope g by the
+        // variance w g^2.
         let [least, most] = SWAY_PX.map(|px| (px / self.cell as f32).powi(2));
         let probe = (PROBE_PX / self.cell as f32).powi(2);
         let mean = self.mean.samples();
@@ -275,6 +285,8 @@ impl Level {
         for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
             let slope =
                 slope_squared([mean[i - 1], mean[i + 1]], [mean[i - width], mean[i + width]]);
+            // A cell tells the sway only if a sway of `PROBE_PX` changes it by more than noise
+            // does, and if no known target can stand out there.
             if probe * slope > noise
                 && !known.iter().any(|cells| cells.are_near([i % width, i / width]))
             {
@@ -283,11 +295,15 @@ impl Level {
                 let change = self.now.samples()[i] - self.contrast * mean[i];
                 told_by += 1;
                 changed += usize::from(change * change > LEAST_CHANGE * LEAST_CHANGE * expected);
+                // w = sum((change^2 - usual) / e) / sum(g^2 / e): each cell is weighted by the
+                // inverse of the squared change e that is expected of it. What exceeds the largest
+                // sway and outlying noise together is cut off.
                 slopes += slope / expected;
                 changes +=
                     ((change * change).min(most * slope + OUTLYING * usual) - usual) / expected;
             }
         }
+        // A scene without texture tells neither its sway nor whether it is another one.
         let is_told = told_by >= LEAST_TEXTURED;
         self.is_lost = is_told && changed as f32 > MOST_CHANGED * told_by as f32;
         if is_told {
@@ -333,6 +349,8 @@ impl Level {
         self.samples.swap(0, 1);
         let [before, now] = &mut self.samples;
         now.clear();
+        // Cut at the least change of a plot: a few changes by targets must not outweigh all of the
+        // noise.
         now.extend(
             changes.iter().step_by(step).map(|change| change.clamp(-LEAST_CHANGE, LEAST_CHANGE)),
         );
@@ -382,6 +400,7 @@ impl CellUpdate {
         Arch::new().dispatch(|| {
             let columns = here.windows(3).zip(&above[1..]).zip(&below[1..]);
             for (out, ((near, above), below)) in to[1..].iter_mut().zip(columns) {
+                // Beside the sway, light changes the contrast of every cell by a share of its own.
                 let lit = CONTRAST_SPREAD * near[1];
                 *out = sway * slope_squared([near[0], near[2]], [*above, *below]) + lit * lit;
             }

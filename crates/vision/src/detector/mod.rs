@@ -153,6 +153,7 @@ impl Detector {
         let Some(finest) = self.levels.first_mut() else { return Findings::default() };
         halve(image, &mut finest.reduced);
         replace_invalid(&mut finest.reduced);
+        // How much the known targets stand out is measured before they are painted over.
         self.watch(known);
         for known in known {
             cover(&mut self.levels[0].reduced, &known.place);
@@ -184,6 +185,7 @@ impl Detector {
             .retain(|watch| known.iter().any(|known| known.id == watch.id && known.is_watched));
         for known in known.iter().filter(|known| known.is_watched) {
             let side = known.place.width.max(known.place.height) / TARGET_CELLS;
+            // Sizes differ by ratios: the nearest scale has the least |ln(cell / side)|.
             let off = |level: &Level| (level.cell() as f64 / side).ln().abs();
             let nearest = (0..self.levels.len())
                 .min_by(|one, other| off(&self.levels[*one]).total_cmp(&off(&self.levels[*other])));
@@ -234,10 +236,12 @@ impl Detector {
         let share = 1.0 - (-interval / NEW_S).exp();
         for watch in &mut self.watches {
             let level = &self.levels[watch.level];
+            // What stands out now, less what the background without the target would show there.
             let excess = watch.stands_out - level.background(watch.place);
             let is_new = watch.stands_out.abs()
                 > STANDS_OUT * level.least_strength() * level.spread
                 && excess.abs() >= NEW * watch.stands_out.abs();
+            // s += a (new - s), a = 1 - exp(-T / tau), new = 0 or 1.
             watch.share_new += share * (f64::from(u8::from(is_new)) - watch.share_new);
         }
         self.watches
@@ -274,6 +278,8 @@ impl Detector {
 /// Whether a candidate is found: it has gone farther than the scene sways, and a target is likelier
 /// than chance by the log-likelihood ratio that is asked.
 fn is_found(candidate: &Candidate, sway_px: f64, asked: f64) -> bool {
+    // The two ways in which what stays in its place seems to move: the scene sways, and a plot's
+    // place is known to a cell over its strength only.
     let moved =
         SWAYS * sway_px + PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
     candidate.plots >= LEAST_PLOTS && candidate.gone_px > moved && candidate.log_ratio() > asked
@@ -283,6 +289,8 @@ fn is_found(candidate: &Candidate, sway_px: f64, asked: f64) -> bool {
 fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: [f64; 2]) -> f32 {
     let corner = place.map(|at| (at / cell as f64).floor() as isize - PART_CELLS as isize);
     let side = 2 * PART_CELLS + 1;
+    // Only this part of the finest scale is averaged down; one cell of the scale is 2^level cells
+    // there.
     let fine = 1 << level;
     let mut part =
         finest.crop(corner[0] * fine as isize, corner[1] * fine as isize, side * fine, side * fine);
@@ -293,6 +301,7 @@ fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: [f64; 2]) -> 
     }
     let mut out = Plane::default();
     stand_out(&part, &mut out, &mut Lines::default());
+    // From pixels to cells of the part; the middle of a cell is a whole number on both sides.
     between(&out, [0, 1].map(|i| (place[i] + 0.5) / cell as f64 - 0.5 - corner[i] as f64))
 }
 
@@ -330,6 +339,7 @@ fn cover(reduced: &mut Plane, place: &PixelBox) {
         let Some(left) = left.or(row.get(last[0]).copied()) else { continue };
         let right = row.get(last[0]).copied().unwrap_or(left);
         for (x, sample) in row[first[0]..last[0]].iter_mut().enumerate() {
+            // Linear from side to side: a flat patch would have edges, which stand out.
             *sample = left + (right - left) * (x as f32 + 0.5) / columns;
         }
     }

@@ -45,6 +45,8 @@ fn outline_within(image: &Plane, plot: &Plot, reach: usize) -> Option<PixelBox> 
         ..side.min(reach + (1.5 * plot.cell).ceil() as usize + 1);
     let places = near.clone().flat_map(|y| near.clone().map(move |x| [x, y]));
     let seed = places.max_by(|one, other| height(*one).total_cmp(&height(*other)))?;
+    // The seed has the plot's sign; the figure itself may be brighter in one part and darker in
+    // another.
     window.samples_mut().iter_mut().for_each(|level| *level = (*level - around).abs());
     let region = figure(&window, seed, spread, (plot.cell / 4.0).ceil() as usize)?;
     Some(region.place(corner, [LEAST_SIDE; 2]))

@@ -75,6 +75,7 @@ pub(super) fn find(levels: &mut [Level], plots: &mut Vec<Plot>) {
         let side = level.change.width();
         for y in 1..level.change.height().saturating_sub(1) {
             let changes = level.change.row(y).iter();
+            // Most rows have no change that is large enough: they are passed over by their maximum.
             if changes.fold(0.0_f32, |most, change| most.max(change.abs())) < LEAST_CHANGE {
                 continue;
             }
@@ -85,6 +86,7 @@ pub(super) fn find(levels: &mut [Level], plots: &mut Vec<Plot>) {
             }
         }
     }
+    // Greedy suppression across scales: a plot is kept if no plot of higher rank explains it.
     plots.sort_by(|a, b| b.rank().total_cmp(&a.rank()));
     let mut kept = 0;
     for index in 0..plots.len() {
@@ -109,6 +111,8 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
     for _ in 0..2 {
         top = greatest_about(&level.now, top, standing);
     }
+    // If the top has the sign opposite to the change or is much lower than it, something has gone
+    // and nothing has come.
     let strength = standing(level.now.row(top[1])[top[0]]) / level.spread;
     let share = level.new_share(top);
     if strength < level.least_strength().max(LEAST_OF_CHANGE * change.abs())

@@ -57,6 +57,8 @@ impl Target {
             self.state.missed += 1;
             return TargetStep::unseen(0.0);
         };
+        // The likeliest hypothesis is reported; its covariance gets the spread of the others
+        // (`covariances`).
         (self.state.motion, self.state.hidden) = (best.motion, best.hidden);
         self.hypotheses.note_doubt(frame.interval);
         let is_unseen =
@@ -69,6 +71,7 @@ impl Target {
         let sure = self.hypotheses.share_near([column, row], self.state.peak_half());
         let fit = self.state.fit_at(column, row, region.origin, scratch, frame.config);
         let is_there = self.identity.doubt(&self.state, frame, fit, scratch);
+        // P(at this place) P(the thing there is the target).
         let certainty = sure * is_there;
         if certainty > SEEN {
             self.state.motion.tell_noise(fit.found().map(|at| at.variance));

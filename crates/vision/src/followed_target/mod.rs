@@ -91,6 +91,8 @@ impl Target {
         let covariances = self.state.motion.covariances();
         [0, 1].map(|i| {
             let mut covariance = covariances[i];
+            // Mixture of places: P11 of the likeliest, plus the mean squared distance of all from
+            // it.
             covariance.m11 += spread[i];
             covariance
         })
@@ -155,6 +157,7 @@ impl Target {
 
     fn follow(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> TargetStep {
         let FrameInput { image, config, .. } = frame;
+        // The gate must hold every hypothesis, but is widened to three times its size at most.
         let reach = self.hypotheses.reach(self.state.position());
         let half = self.state.half_gate(image, config);
         let image_sides = [image.width(), image.height()];
@@ -221,6 +224,8 @@ impl Target {
             let off = |i: usize| {
                 (found[i].position - expected[i].position).powi(2) / expected[i].variance
             };
+            // Widened by as much as brings the innovation back to the limit; then the fit is taken
+            // without doubt.
             self.state.motion.inflate((off(0).max(off(1)) / MANOEUVRE).clamp(1.0, MOST_INFLATED));
             self.state.motion.update(&PlaceEvidence::of(found));
             self.seen(fit.place);
@@ -254,6 +259,7 @@ impl Target {
         config: &TrackerConfig,
     ) -> PlaceEvidence {
         let narrow = fitted.iter().all(|at| at.variance < NARROW);
+        // The posterior was made with this floor in its prior, so it is taken out with it.
         let floor = config.prediction_floor_px.powi(2);
         let expected = self
             .state

@@ -47,6 +47,8 @@ struct PixelModel {
 impl ImmConfig {
     fn models(&self, interval: f32) -> [PixelModel; MODELS] {
         let constant =
+            // The order-0 state has one component; a rate that is always 0 makes it as long as the
+            // others (erratum).
             PixelModel { rate: 0.0, keep: 0.0, noise: [self.constant_sd.powi(2), 0.0, 0.0] };
         // M = S S' sigma_M^2 with S = [T^2 / 2, T]' (erratum: the square is missing).
         let (half, drift) = (interval * interval / 2.0, self.drift_sd.powi(2));
@@ -189,6 +191,7 @@ impl EightPixels {
                 mixed = mixed + weights[m] * states[m][0];
                 rate = rate + weights[m] * states[m][1];
             }
+            // P = sum w_m (P_m + d d'), d = x_m - x: the spread of the means is part of it.
             let [mut p11, mut p12, mut p22] = [zero; 3];
             for m in 0..MODELS {
                 let (d0, d1) = (states[m][0] - mixed, states[m][1] - rate);

@@ -83,6 +83,7 @@ impl Adaptation {
             ReferenceStrategy::Replacement => 1.0,
             ReferenceStrategy::Smoothing { memory } => (1.0 - memory) * certainty,
             ReferenceStrategy::Mean { least_share } => {
+                // 1 / (n + 1) is the new image's weight in a plain mean.
                 certainty * (1.0 / (self.images + 1.0)).max(least_share)
             }
             ReferenceStrategy::PixelImm(_) => {
@@ -101,6 +102,7 @@ impl Adaptation {
         for (old, new) in reference.samples_mut().iter_mut().zip(image.samples()) {
             *old += share * (new - *old);
         }
+        // Images' noises are independent: v = (1 - s)^2 v + s^2 v_image.
         self.noise = (1.0 - share).powi(2) * self.noise + share * share * noise;
         self.images += certainty;
         share

@@ -74,6 +74,7 @@ impl Handover {
     /// The sure targets that one camera alone sees, with predictions for cueing: their range is
     /// unknown.
     pub(super) fn known(&self, now: Timestamp) -> Vec<CueTarget> {
+        // Geometric mean: the middle of ln r.
         let range = (NEAREST_M * self.rules.max_range_m).sqrt();
         let sure = self.seen.iter().flat_map(|(camera, seen)| {
             let open = |one: &&SeenDirection| {
@@ -187,6 +188,7 @@ impl Handover {
             begun.push(ContinuedLine { index, number: one.number, first: one.first });
         }
         let mut place = 0..;
+        // What a track or something rooted explains is no direction of its own any more.
         seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
         for (index, line) in with_pose.into_iter().enumerate() {
             if !taken[index] && !is_known(index) && seen.len() < MAX_SEEN {
@@ -235,10 +237,14 @@ impl Handover {
                 let reading = one
                     .placed(camera, (line, now), (self.rules.speed, self.rules.max_range_m), motion)
                     .and_then(|track| {
+                        // Price of the velocity that the reading implies: v^2 / (2 sd^2), of a
+                        // prior about zero.
                         let unlikely = track.state().velocity().norm_squared()
                             / (2.0 * self.rules.speed.powi(2));
                         let expected = context.expectation(&track)?;
                         let fit = expected.fit(line, self.rules.gate)?;
+                        // Against one other target in the view: the line is there, so it is not
+                        // weighed by P_D.
                         let ratio = fit.log_ratio(1.0, self.rules.clutter_per_sr(known)) - unlikely;
                         let one_target = OneTargetTest::of_one(camera, one.sight.clone());
                         let mut reading = Reading {
@@ -271,6 +277,7 @@ impl Handover {
             .copied()
             .filter(|one| is_new(one) && one.ratio() >= MARGIN && one.track.is_placed())
             .filter(|one| {
+                // Rivals share the newest line or the direction that was followed first.
                 let mut rivals = all.iter().filter(|other| {
                     other.ratio() > one.ratio() - MARGIN
                         && (other.newest == one.newest || other.of == one.of)

@@ -102,6 +102,7 @@ impl Reading {
                 rules,
             );
         }
+        // Its best line belongs to a track: then so does the target, and the reading ends.
         best.is_none_or(|(_, index)| !is_owned[index])
     }
 

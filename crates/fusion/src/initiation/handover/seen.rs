@@ -130,6 +130,7 @@ impl SeenDirection {
     pub(super) fn state_at(&self, range: f64, speed: f64) -> Option<KinematicState> {
         let Self { sight, line: last, .. } = self;
         let along = sight.direction.into_inner();
+        // v = r (I - u u') w: the turning rate across the direction, times the range.
         let velocity = (sight.rate - along * along.dot(&sight.rate)) * range;
         let model = BearingModel::new(last.line.origin, last.line.origin + along * range)?;
         let [across, along_squared] =
