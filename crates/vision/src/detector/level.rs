@@ -283,6 +283,9 @@ impl Level {
         let mean = self.mean.samples();
         let noise = self.spread * self.spread;
         for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
+            if matches!(i % width, 0) || i % width == width - 1 {
+                continue;
+            }
             let slope =
                 slope_squared([mean[i - 1], mean[i + 1]], [mean[i - width], mean[i + width]]);
             // A cell tells the sway only if a sway of `PROBE_PX` changes it by more than noise
