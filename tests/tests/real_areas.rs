@@ -100,11 +100,10 @@ impl Outcome {
         *self.numbers.values().max().unwrap() as f64 / self.said as f64
     }
 
-    /// Mean square at the instants at which others said something too.
-    fn mean_square_with(&self, others: [&Self; 2]) -> f64 {
-        let told = |instant: &usize| others.iter().all(|other| other.squares.contains_key(instant));
-        let squares: Vec<f64> =
-            self.squares.iter().filter(|(instant, _)| told(instant)).map(|(_, s)| *s).collect();
+    /// Mean square at some instants at which it said something.
+    fn mean_square(&self, is_asked: impl Fn(&usize) -> bool) -> f64 {
+        let asked = self.squares.iter().filter(|(instant, _)| is_asked(instant));
+        let squares: Vec<f64> = asked.map(|(_, square)| *square).collect();
         squares.iter().sum::<f64>() / squares.len() as f64
     }
 }
@@ -194,11 +193,23 @@ fn a_real_drone_is_one_target_however_its_cameras_are_divided() {
     for areas in ways().into_iter().step_by(6) {
         let [west, east] = [&areas[0], &areas[1]].map(|area| run([area, &[]]));
         let both = run([&areas[0], &areas[1]]);
-        // Where one alone says nothing is where the other has little to say: at the same instants.
-        let mean = |outcome: &Outcome| outcome.mean_square_with([&west, &east]);
+        // At the same instants: where one says nothing the other has little to say.
+        let says = |outcome: &Outcome, instant: &usize| outcome.squares.contains_key(instant);
+        let all_say = |k: &usize| says(&west, k) && says(&east, k) && says(&both, k);
+        let mean = |outcome: &Outcome| outcome.mean_square(all_say);
+        // Where one of them alone says something, together they say it as well.
+        let alone = |k: &usize| match (west.squares.get(k), east.squares.get(k)) {
+            (Some(square), None) | (None, Some(square)) => Some(*square),
+            _ => None,
+        };
+        let elsewhere: Vec<[f64; 2]> =
+            both.squares.iter().filter_map(|(k, square)| Some([*square, alone(k)?])).collect();
+        let [by_both, by_one] =
+            [0, 1].map(|i| elsewhere.iter().map(|squares| squares[i]).sum::<f64>());
         println!(
             "{areas:?}: said {} times ({} and {} alone), one number {:.3} ({:.3} and {:.3}), two at once {}, \
-             mean square {:.3} ({:.3} and {:.3} m^2)",
+             mean square {:.3} ({:.3} and {:.3} m^2), \
+             where one alone says something {by_both:.1} m^2 ({by_one:.1}) in all",
             both.said,
             west.said,
             east.said,
@@ -215,5 +226,6 @@ fn a_real_drone_is_one_target_however_its_cameras_are_divided() {
         assert!(both.by.iter().all(|said| *said > both.said / 20), "both say it: {:?}", both.by);
         assert!(both.twice < both.said / 30, "{}", both.twice);
         assert!(mean(&both) < mean(&west).max(mean(&east)), "no worse than the worse of the two");
+        assert!(by_both < 1.1 * by_one, "no worse than the one that sees it alone");
     }
 }

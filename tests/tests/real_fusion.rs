@@ -139,9 +139,9 @@ struct Asked {
     most: [f64; 3],
 }
 
-/// Poses and clocks come from the flight's first half; the fit's residual is declared as the poses'
-/// deviation, and the time in which the drone moves by as much as the clocks'. The limits are what is reached now and a little
-/// more: they guard it, and do not say that it is good.
+/// Poses and clocks come from the flight's first half. The fit's residual is declared as the poses'
+/// deviation, and as that of the clocks the time in which the drone moves by as much. The limits are
+/// what is reached now and a little more: they guard it, and do not say that it is good.
 const ASKED: [Asked; 3] = [
     Asked {
         dataset: "3",

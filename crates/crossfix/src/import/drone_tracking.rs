@@ -62,6 +62,12 @@ pub struct ImportedFlight {
 /// the cameras have not been calibrated.
 const RAW_LABEL_SD_PX: f64 = 1.0;
 
+/// Time over which the drone's angular rate is taken, s: with a frame's it would be the labels'
+/// noise, with a second's the drone's turns would be lost.
+const RATE_OVER_S: f64 = 0.2;
+/// Largest standard deviation of a clock, s: one of which nothing is known.
+const MOST_CLOCK_SD_S: f64 = 1.0;
+
 #[derive(Debug, Deserialize)]
 struct Split {
     calibration_rtk_index_ranges: Vec<[f64; 2]>,
@@ -289,15 +295,23 @@ impl CameraSource<'_> {
     /// are counted, and phones lose some. 6 to 43 ms for these cameras.
     fn clock_sd_s(&self, labels: &[ImportedLabel], model: &CameraModel) -> f64 {
         let direction = |label: &ImportedLabel| model.direction(label.pixel?).ok();
-        let squared_rates: Vec<f64> = labels
-            .windows(2)
-            .filter(|pair| pair[1].frame == pair[0].frame + 1)
-            .filter_map(|pair| Some(direction(&pair[0])?.angle(&*direction(&pair[1])?)))
-            .map(|angle| (angle * self.lens.fps).powi(2))
-            .collect();
-        let mean_square = squared_rates.iter().sum::<f64>() / squared_rates.len().max(1) as f64;
-        // A drone that does not move says nothing of a clock, and needs none.
-        if mean_square > 0.0 { self.fitted.residual_sigma_rad / mean_square.sqrt() } else { 0.0 }
+        let mut squared_rates = Vec::new();
+        for (index, first) in labels.iter().enumerate() {
+            let seconds = |later: &ImportedLabel| {
+                later.frame.saturating_sub(first.frame) as f64 / self.lens.fps
+            };
+            let later = labels[index..].iter().find(|later| seconds(later) >= RATE_OVER_S);
+            let Some(later) = later.filter(|later| seconds(later) < 2.0 * RATE_OVER_S) else {
+                continue;
+            };
+            if let (Some(before), Some(after)) = (direction(first), direction(later)) {
+                squared_rates.push((before.angle(&after) / seconds(later)).powi(2));
+            }
+        }
+        let rate = (squared_rates.iter().sum::<f64>() / squared_rates.len() as f64).sqrt();
+        // Without a rate nothing is known of the clock.
+        let clock_sd_s = self.fitted.residual_sigma_rad / rate;
+        if clock_sd_s.is_nan() { MOST_CLOCK_SD_S } else { clock_sd_s.min(MOST_CLOCK_SD_S) }
     }
 
     fn label_sd_rad(&self) -> f64 {
@@ -441,14 +455,17 @@ mod tests {
     fn a_clock_is_as_unsure_as_the_residual_leaves_it() {
         let (lens, fitted, site) = (lens(0.0), fitted(), "test".parse().unwrap());
         let source = CameraSource { site: &site, fitted: &fitted, lens: &lens, is_raw: false };
-        // 2 of 500 px a frame are 120 mrad/s; the gap between frames 1 and 8 is no step of one frame.
+        // 12 of 500 px in six frames are 120 mrad/s; over the gap before frame 60 there is no rate.
         let label = |frame, x| ImportedLabel { frame, pixel: Some(Pixel::new(x, 540.0)) };
-        let labels = [label(0, 960.0), label(1, 962.0), label(8, 1200.0)];
-        let entries = source.entries(&labels, |_| true).unwrap();
-        let frame = decode::<BearingFrame>(&entries[1].data).unwrap();
-        assert!((frame.capture_time_sd_s - 0.001 / 0.12).abs() < 1e-6, "{frame:?}");
-        let still = source.entries(&labels[..1], |_| true).unwrap();
-        assert_eq!(decode::<BearingFrame>(&still[1].data).unwrap().capture_time_sd_s, 0.0);
+        let labels = [label(0, 954.0), label(6, 966.0), label(60, 1200.0)];
+        let sd_s = |labels: &[ImportedLabel]| {
+            let entries = source.entries(labels, |_| true).unwrap();
+            decode::<BearingFrame>(&entries[1].data).unwrap().capture_time_sd_s
+        };
+        assert!((sd_s(&labels) - 0.001 / 0.12).abs() < 1e-6, "{}", sd_s(&labels));
+        assert_eq!(sd_s(&labels[..1]), MOST_CLOCK_SD_S);
+        assert_eq!(sd_s(&[label(0, 960.0), label(6, 960.0)]), MOST_CLOCK_SD_S, "it does not move");
+        assert_eq!(sd_s(&[label(0, 960.0), label(u64::MAX, 960.0)]), MOST_CLOCK_SD_S);
     }
 
     #[test]

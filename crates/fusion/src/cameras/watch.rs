@@ -37,8 +37,7 @@ const FREEDOM: f64 = 4.0;
 /// A camera is said to have been moved if the lines are this many times (logarithm) more likely by
 /// it: a thousand times, as one of a site's is moved about once in so many minutes, a day. Of the 62
 /// ways of taking two, three, four or six cameras of the real flights, two name one that stands
-/// where it stood: one whose clock has jumped, and one of the best. With clocks declared exact that
-/// were off by a tenth of a second, 39 did.
+/// where it stood. With clocks declared exact that were off by up to a tenth of a second, 39 did.
 const SURE: f64 = 6.9;
 /// Another camera may have been moved in its place unless that is less likely by more than this
 /// (logarithm): one in a hundred.

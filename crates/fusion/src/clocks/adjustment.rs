@@ -193,7 +193,7 @@ impl<'a> Adjustment<'a> {
             let place = self.target(sight, state).place;
             let residual = whitened(sight, place, self.scales[sight.camera]);
             if let Some(residual) = residual.filter(|z| z.norm_squared() <= OUTLIER) {
-                means[sight.camera].add(sight.time_s, residual);
+                means[sight.camera].add(sight.time_s, residual, sight.allowance);
             }
         }
         let inflations: Vec<f64> = means.iter().map(BatchMeans::inflation).collect();

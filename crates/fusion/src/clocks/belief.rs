@@ -7,6 +7,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, DVector, Matrix6};
 
 use super::ClockEstimate;
+use super::batch_means::inflated;
 use super::common_time::{ClockReading, Common, LIARS_SD_S, common_time};
 
 /// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
@@ -444,12 +445,30 @@ impl Belief {
         row
     }
 
+    /// Variance of a clock's offset from the common time before any bearing, s^2:
+    /// `(1 - s_k)^2 v_k + sum s_i^2 v_i` over the other clocks i, with shares s and variances v.
+    fn unlearnt(&self, clock: &ClockEntry) -> f64 {
+        let part = |(other, share): (&ClockEntry, f64)| {
+            let own = if other.place == clock.place { 1.0 - share } else { share };
+            own.powi(2) * other.prior
+        };
+        self.shares().map(part).sum()
+    }
+
+    /// Factor by which the information on the clocks of some cameras was overstated in earlier
+    /// windows, the mean over those of which it is known; `None` before any.
+    pub(super) fn inflation(&self, cameras: &[CameraName]) -> Option<f64> {
+        let known = cameras.iter().filter_map(|camera| self.cameras.get(camera)?.inflation);
+        let known: Vec<f64> = known.collect();
+        (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
+    }
+
     /// The estimate of a camera's clock at a time.
     pub(super) fn estimate(&self, camera: &CameraName, time: Timestamp) -> Option<ClockEstimate> {
         let clock = self.cameras.get(camera)?;
         let ahead = self.ahead(time);
         let (offset, own, common) = self.absolute(clock, 0, ahead);
-        let own = inflated(own, clock.prior + common, clock.inflation.unwrap_or(1.0));
+        let own = inflated(own, self.unlearnt(clock), clock.inflation.unwrap_or(1.0));
         let (drift, own_drift, common_drift) = self.absolute(clock, 1, ahead);
         Some(ClockEstimate {
             offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
@@ -487,16 +506,6 @@ impl Belief {
             self.site[i] - common.sum::<f64>()
         })
     }
-}
-
-/// Variance of an estimate whose information beyond its prior is overstated by a factor.
-fn inflated(variance: f64, prior: f64, inflation: f64) -> f64 {
-    if variance <= 0.0 || variance >= prior {
-        return variance;
-    }
-    // 1 / variance = 1 / prior + information
-    let information = variance.recip() - prior.recip();
-    (prior.recip() + information / inflation).recip()
 }
 
 #[cfg(test)]

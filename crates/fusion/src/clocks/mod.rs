@@ -19,7 +19,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, ClockSource, Timestamp};
-use nalgebra::{Matrix2, Matrix6};
+use nalgebra::Matrix6;
 
 use self::belief::Belief;
 use self::window::{Role, TrackWindow};
@@ -301,10 +301,7 @@ impl ClockEstimator {
         let is_new = !self.windows[index].cameras.contains(camera);
         let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
         let window = &mut self.windows[index];
-        // The part of the noise that lasts counts as white noise that averages out as slowly.
-        let lasting = exposure.uncertainty.lasting.as_white(window.since_last(camera, time));
-        let covariance = line.covariance + Matrix2::identity() * lasting;
-        let line = SightLine { covariance, ..*line };
+        let line = (*line, exposure.uncertainty.lasting);
         window.add(camera, role, time, line, track.position_at(exposure.time).coords);
     }
 

@@ -2,9 +2,10 @@
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::Vector3;
+use nalgebra::{Matrix2, Vector3};
 
 use crate::track::TrackId;
+use crate::uncertainty::CorrelatedNoise;
 
 /// Most bearings of a window: when it is full, every other one of each camera is dropped, and from
 /// then on as many of the new ones are not taken.
@@ -30,6 +31,8 @@ pub(super) struct WindowBearing {
     pub(super) camera: usize,
     /// With the covariance that was reported, and the noise that lasts counted in as white.
     pub(super) line: SightLine,
+    /// Factor by which that is more than the variance of this bearing alone.
+    pub(super) allowance: f64,
     /// Where the track had the target at that time.
     pub(super) place: Vector3<f64>,
 }
@@ -71,13 +74,14 @@ impl TrackWindow {
         }
     }
 
-    /// Takes in a bearing, stamped by the camera's own clock, with where the track has the target.
+    /// Takes in a bearing, stamped by the camera's own clock, with the part of its errors that lasts
+    /// and where the track has the target.
     pub(super) fn add(
         &mut self,
         camera: &CameraName,
         role: Role,
         time: Timestamp,
-        line: SightLine,
+        (mut line, lasting): (SightLine, CorrelatedNoise),
         place: Vector3<f64>,
     ) {
         let time_s = time.seconds_since(self.start);
@@ -99,18 +103,22 @@ impl TrackWindow {
         let number = self.offered[index];
         self.offered[index] += 1;
         if number.is_multiple_of(self.thinned) {
-            self.sights.push(WindowBearing { time_s, camera: index, line, place });
+            // The part of the noise that lasts counts as white noise that averages out as slowly.
+            let alone = line.covariance.trace() + 2.0 * lasting.variance();
+            let as_white = lasting.as_white(self.since_last(index, time_s));
+            line.covariance += Matrix2::identity() * as_white;
+            let allowance = line.covariance.trace() / alone;
+            self.sights.push(WindowBearing { time_s, camera: index, line, allowance, place });
         }
         if self.sights.len() >= MAX_SIGHTS {
             self.thin();
         }
     }
 
-    /// Time since the camera's last bearing in the window, s; infinite if there is none.
-    pub(super) fn since_last(&self, camera: &CameraName, time: Timestamp) -> f64 {
-        let index = self.cameras.iter().position(|known| known == camera);
-        let last = self.sights.iter().rev().find(|sight| Some(sight.camera) == index);
-        last.map_or(f64::INFINITY, |last| time.seconds_since(self.start) - last.time_s)
+    /// Time since a camera's last bearing in the window, s; infinite if there is none.
+    fn since_last(&self, camera: usize, time_s: f64) -> f64 {
+        let last = self.sights.iter().rev().find(|sight| sight.camera == camera);
+        last.map_or(f64::INFINITY, |last| time_s - last.time_s)
     }
 
     /// Drops every other bearing of each camera.
@@ -180,7 +188,13 @@ mod tests {
         for k in 0..9000_u32 {
             let camera = ["a", "b", "c"][k as usize % 3].parse().unwrap();
             let time = Timestamp::from_seconds(f64::from(k) * 1e-3);
-            window.add(&camera, Role::Wanted, time, line, Vector3::zeros());
+            window.add(
+                &camera,
+                Role::Wanted,
+                time,
+                (line, CorrelatedNoise::NONE),
+                Vector3::zeros(),
+            );
         }
         assert!(
             (MAX_SIGHTS / 2..=MAX_SIGHTS).contains(&window.sights.len()),
@@ -205,7 +219,7 @@ mod tests {
                 &camera,
                 role,
                 Timestamp::from_seconds(f64::from(k) / 60.0),
-                line,
+                (line, CorrelatedNoise::NONE),
                 Vector3::zeros(),
             );
         }

@@ -74,7 +74,9 @@ impl JumpTest<'_> {
     fn learn(mut self) -> WindowUpdate {
         let plain = adjust(&self.belief, self.window, &self.components);
         let fitting = plain.as_ref().filter(|adjusted| fits(adjusted));
-        if let Some(adjusted) = fitting.filter(|adjusted| !is_suspicious(adjusted)) {
+        let inflation = self.belief.inflation(&self.window.cameras).unwrap_or(1.0);
+        let is_plain = |adjusted: &&AdjustedCameras| !is_suspicious(adjusted, inflation);
+        if let Some(adjusted) = fitting.filter(is_plain) {
             return WindowUpdate::Accepted(Box::new(self.learnt(self.belief.clone(), adjusted)));
         }
         // Try a jump within the window first, then for each suspect a jump before it, at a price.
@@ -85,7 +87,10 @@ impl JumpTest<'_> {
             return WindowUpdate::Accepted(Box::new(belief));
         }
         let mut best = fitting.map(|adjusted| (adjusted.clone(), self.belief.clone()));
+        // A jump makes the residuals repeat that do not allow for it: earlier windows tell how far
+        // they do otherwise.
         let without_jump = plain.as_ref().map_or(1.0, |adjusted| adjusted.inflation);
+        let usual = self.belief.inflation(&self.window.cameras).unwrap_or(without_jump);
         for camera in suspects {
             let mut doubting = self.belief.clone();
             doubting.doubt_jumped(camera);
@@ -96,7 +101,7 @@ impl JumpTest<'_> {
             // The prior probability of a jump, as a price on the evidence.
             // Evidence of bearings that repeat one another is overstated as their information is. A
             // clock that is free fits their errors too, and hides that they repeat.
-            let inflation = adjusted.inflation.max(without_jump);
+            let inflation = adjusted.inflation.max(usual);
             let evidence = adjusted.evidence - JUMP * inflation;
             if best.as_ref().is_none_or(|(best, _)| evidence > best.evidence) {
                 best = Some((AdjustedCameras { evidence, ..adjusted }, doubting));
@@ -180,10 +185,12 @@ fn fits(adjusted: &AdjustedCameras) -> bool {
         && adjusted.outlier_shares.iter().all(|share| *share < MAX_OUTLIERS)
 }
 
-fn is_suspicious(adjusted: &AdjustedCameras) -> bool {
+/// Whether a clock may have jumped; `inflation` is the factor by which the information of the prior
+/// is overstated.
+fn is_suspicious(adjusted: &AdjustedCameras, inflation: f64) -> bool {
+    // The distance from the prior is squared, and too large by as much.
     adjusted.scales.iter().any(|scale| *scale > SUSPICIOUS_SCALE)
-        // In the mean a right prior is pulled by one per unknown at most.
-        || adjusted.pulled > SUSPICIOUS_PULL * adjusted.cameras.len() as f64
+        || adjusted.pulled > inflation * SUSPICIOUS_PULL * adjusted.cameras.len() as f64
 }
 
 /// Fits a window with the belief as the prior of clocks and poses.

@@ -283,7 +283,7 @@ impl Level {
         let mean = self.mean.samples();
         let noise = self.spread * self.spread;
         for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
-            if matches!(i % width, 0) || i % width == width - 1 {
+            if i % width == 0 || i % width == width - 1 {
                 continue;
             }
             let slope =
