@@ -160,7 +160,7 @@ fn poses_that_are_off_are_not_taken_for_clocks() {
 
 /// Labels drawn by hand, and trackers, sit beside the target for a second or so: a hundred bearings
 /// then tell no more of a clock than a few do. What is stated allows for what lasts within two
-/// seconds, but not for what the fitted trajectory takes up: it is right to a factor of 1.7. Taken
+/// seconds, but not for what the fitted trajectory takes up: it is right to a factor of 2.1. Taken
 /// as independent, they were off by seven times what was stated.
 #[test]
 fn errors_that_last_are_not_taken_for_clocks() {
@@ -170,7 +170,7 @@ fn errors_that_last_are_not_taken_for_clocks() {
             tally.fly(&scene(site(), vec![path()], 30.0), &random_clocks(&["b", "c"], seed), seed);
         }
         let line = tally.line("");
-        assert!(tally.normalised() < 1.7_f64.powi(2), "{line}");
+        assert!(tally.normalised() < 2.1_f64.powi(2), "{line}");
         assert!(tally.stated() < 1.2 * tally.rms(), "{line}");
     }
 }
@@ -227,15 +227,15 @@ fn a_clock_that_jumps_is_learnt_anew_within_twenty_seconds() {
     }
 }
 
-/// Part of a small jump is taken for drift at first: after 20 s it is known to a tenth, and that is
-/// twice what is stated.
+/// A small jump is taken for drift, and for errors that last, at first: half a minute later it is
+/// known to a tenth, and that is twice what is stated.
 #[test]
 fn a_clock_that_jumps_by_a_frame_is_followed_too() {
     let mut tally = Tally::default();
     for seed in 0..4 {
         tally.fly(&scene(site(), vec![circle()], 30.0), &jumping(0.02, seed), seed);
     }
-    assert!(tally.settled.iter().all(|time| *time < 46.0), "{:?}", tally.settled);
+    assert!(tally.settled.iter().all(|time| *time < 55.0), "{:?}", tally.settled);
     assert!(tally.rms() < 2e-3 && tally.normalised() < 4.5, "{}", tally.line(""));
     assert_there(&tally);
 }

@@ -102,9 +102,8 @@ pub(super) struct AdjustedCameras {
     pub(super) covariance: DMatrix<f64>,
     /// Factor on each camera's reported covariances: 1 where these agree with its residuals.
     pub(super) scales: Vec<f64>,
-    /// Factor by which the information of the bearings on clocks and poses is overstated, as their
-    /// residuals are not independent: the mean over the bearings, at least 1.
-    pub(super) inflation: f64,
+    /// Factor by which the bearings of each camera repeat one another, at least 1.
+    pub(super) inflations: Vec<f64>,
     /// Share of each camera's bearings that do not fit.
     pub(super) outlier_shares: Vec<f64>,
     /// Squared Mahalanobis distance of clocks and poses from their prior.
@@ -122,6 +121,8 @@ pub(super) struct Adjustment<'a> {
     prior: &'a ClockAndPosePrior,
     /// Factor on each camera's covariances.
     scales: Vec<f64>,
+    /// Weight of each camera's bearings: the inverse of the factor by which they repeat one another.
+    weights: Vec<f64>,
 }
 
 impl<'a> Adjustment<'a> {
@@ -129,11 +130,14 @@ impl<'a> Adjustment<'a> {
         sights: &'a [WindowBearing],
         curve: Curve,
         prior: &'a ClockAndPosePrior,
+        inflations: &[f64],
     ) -> Self {
-        Self { sights, curve, prior, scales: vec![1.0; prior.cameras.len()] }
+        let weights = inflations.iter().map(|inflation| inflation.recip()).collect();
+        Self { sights, curve, prior, scales: vec![1.0; prior.cameras.len()], weights }
     }
 
-    /// Fits trajectory, clocks and poses. `None` if the numbers fail.
+    /// Fits trajectory, clocks and poses. `None` if the numbers fail. Evidences can be compared
+    /// between fits of the same weights.
     pub(super) fn solve(mut self, density: i32) -> Option<AdjustedCameras> {
         // Huber's loss still draws the far ones in, while all may be far off; the trimmed one, from
         // then on, lets strangers go.
@@ -143,7 +147,7 @@ impl<'a> Adjustment<'a> {
         if self.rescale(&state, Loss::Trimmed) {
             (state, density, evidence) = self.best_density(state, density)?;
         }
-        let inflation = self.inflation(&state);
+        let inflations = self.inflations(&state);
         let outlier_shares =
             self.squares(&state).iter().map(|squares| outlier_share(squares)).collect();
         let (covariance, pulled) = self.posterior(&state, density)?;
@@ -151,7 +155,7 @@ impl<'a> Adjustment<'a> {
             cameras: state.cameras,
             covariance,
             scales: self.scales,
-            inflation,
+            inflations,
             outlier_shares,
             pulled,
             evidence,
@@ -186,8 +190,8 @@ impl<'a> Adjustment<'a> {
         changed
     }
 
-    /// Factor by which the information of all bearings is overstated.
-    fn inflation(&self, state: &WindowState) -> f64 {
+    /// Factor by which the bearings of each camera repeat one another.
+    fn inflations(&self, state: &WindowState) -> Vec<f64> {
         let mut means = vec![BatchMeans::default(); self.scales.len()];
         for sight in self.sights {
             let place = self.target(sight, state).place;
@@ -196,9 +200,7 @@ impl<'a> Adjustment<'a> {
                 means[sight.camera].add(sight.time_s, residual, sight.allowance);
             }
         }
-        let inflations: Vec<f64> = means.iter().map(BatchMeans::inflation).collect();
-        let of_sights = self.sights.iter().map(|sight| inflations[sight.camera]);
-        of_sights.sum::<f64>() / self.sights.len().max(1) as f64
+        means.iter().map(BatchMeans::inflation).collect()
     }
 
     /// Squared Mahalanobis distances of each camera's bearings.
@@ -303,8 +305,8 @@ impl<'a> Adjustment<'a> {
         let before = self.prior.precision.clone().cholesky()?;
         let log_before: f64 = 2.0 * before.l_dirty().diagonal().map(f64::ln).sum();
         // ln det(s R) = 2 ln s + ln det R for the two coordinates of a bearing.
-        let scales =
-            self.sights.iter().map(|sight| 2.0 * self.scales[sight.camera].ln()).sum::<f64>();
+        let scale = |camera: usize| 2.0 * self.weights[camera] * self.scales[camera].ln();
+        let scales = self.sights.iter().map(|sight| scale(sight.camera)).sum::<f64>();
         let width = self.curve.log_width(jerk(density));
         // 2 ln Z = ln det(prior precision) - cost - ln det A - widths of curve prior and bearing
         // noise.
@@ -360,17 +362,17 @@ impl<'a> Adjustment<'a> {
         let mut quadratic = self.prior_quadratic(state, density);
         for sight in self.sights {
             let target = self.target(sight, state);
+            let share = self.weights[sight.camera];
             let Some(seen) = BearingResidual::at(sight, target.place, self.scales[sight.camera])
             else {
                 // Behind the camera: as far off as can be.
-                quadratic.cost += loss.of(1e6).0;
+                quadratic.cost += share * loss.of(1e6).0;
                 continue;
             };
             let (cost, weight) = loss.of(seen.squared);
-            quadratic.cost += cost;
+            quadratic.cost += share * cost;
             if weight > 0.0 {
-                // g += w J' R^-1 z and A += w J' R^-1 J.
-                quadratic.add(&target, state.coefficients.len(), &seen, weight);
+                quadratic.add(&target, state.coefficients.len(), &seen, share * weight);
             }
         }
         quadratic

@@ -7,7 +7,6 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, DVector, Matrix6};
 
 use super::ClockEstimate;
-use super::batch_means::inflated;
 use super::common_time::{ClockReading, Common, LIARS_SD_S, common_time};
 
 /// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
@@ -46,7 +45,7 @@ struct ClockEntry {
     drift_prior: f64,
     /// Random walk of its offset beside [`OFFSET_WALK`], s^2/s.
     walk: f64,
-    /// Factor by which the information of the bearings on it is overstated, the mean of the latest
+    /// Factor by which the bearings of its camera repeat one another, the mean of the latest
     /// windows; `None` before any.
     inflation: Option<f64>,
 }
@@ -256,13 +255,11 @@ impl Belief {
         }
     }
 
-    /// Takes in the factor by which a window's information on the clocks of some cameras is
-    /// overstated. The belief is updated as if the bearings were independent, which weighs the
-    /// windows as well as any common factor does; what is stated of it allows for the factor.
-    pub(super) fn see_inflation(&mut self, cameras: &[CameraName], inflation: f64) {
-        for camera in cameras {
+    /// Takes in the factors by which the bearings of some cameras repeat one another in a window.
+    pub(super) fn see_inflations(&mut self, cameras: &[CameraName], inflations: &[f64]) {
+        for (camera, inflation) in cameras.iter().zip(inflations) {
             if let Some(clock) = self.cameras.get_mut(camera) {
-                let mean = clock.inflation.get_or_insert(inflation);
+                let mean = clock.inflation.get_or_insert(*inflation);
                 *mean += INFLATION_WEIGHT * (inflation - *mean);
             }
         }
@@ -445,22 +442,15 @@ impl Belief {
         row
     }
 
-    /// Variance of a clock's offset from the common time before any bearing, s^2:
-    /// `(1 - s_k)^2 v_k + sum s_i^2 v_i` over the other clocks i, with shares s and variances v.
-    fn unlearnt(&self, clock: &ClockEntry) -> f64 {
-        let part = |(other, share): (&ClockEntry, f64)| {
-            let own = if other.place == clock.place { 1.0 - share } else { share };
-            own.powi(2) * other.prior
-        };
-        self.shares().map(part).sum()
+    /// Whether all offsets are such as clocks may have: beyond [`MAX_OFFSET_S`] a fit has gone astray.
+    pub(super) fn is_possible(&self) -> bool {
+        self.clock_places().all(|place| self.mean[place].abs() <= MAX_OFFSET_S)
     }
 
-    /// Factor by which the information on the clocks of some cameras was overstated in earlier
-    /// windows, the mean over those of which it is known; `None` before any.
-    pub(super) fn inflation(&self, cameras: &[CameraName]) -> Option<f64> {
-        let known = cameras.iter().filter_map(|camera| self.cameras.get(camera)?.inflation);
-        let known: Vec<f64> = known.collect();
-        (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
+    /// Factor by which the bearings of a camera have repeated one another in the latest windows;
+    /// `None` before any.
+    pub(super) fn inflation(&self, camera: &CameraName) -> Option<f64> {
+        self.cameras.get(camera)?.inflation
     }
 
     /// The estimate of a camera's clock at a time.
@@ -468,7 +458,6 @@ impl Belief {
         let clock = self.cameras.get(camera)?;
         let ahead = self.ahead(time);
         let (offset, own, common) = self.absolute(clock, 0, ahead);
-        let own = inflated(own, self.unlearnt(clock), clock.inflation.unwrap_or(1.0));
         let (drift, own_drift, common_drift) = self.absolute(clock, 1, ahead);
         Some(ClockEstimate {
             offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),

@@ -51,6 +51,8 @@ struct JumpTest<'a> {
     belief: Belief,
     components: Vec<usize>,
     window: &'a TrackWindow,
+    /// Factors by which the bearings of its cameras repeat one another.
+    inflations: Vec<f64>,
 }
 
 /// The belief after a window. If the window does not fit it well, a camera's clock may have jumped.
@@ -67,16 +69,16 @@ pub(super) fn window_update(belief: &Belief, window: &TrackWindow) -> WindowUpda
         return WindowUpdate::Uninformative;
     }
     let components = components(&belief, &window);
-    JumpTest { belief, components, window: &window }.learn()
+    let inflations = vec![1.0; window.cameras.len()];
+    JumpTest { belief, components, window: &window, inflations }.learn()
 }
 
 impl JumpTest<'_> {
     fn learn(mut self) -> WindowUpdate {
-        let plain = adjust(&self.belief, self.window, &self.components);
+        self.inflations = self.expected_inflations();
+        let plain = self.fit(&self.belief, self.window);
         let fitting = plain.as_ref().filter(|adjusted| fits(adjusted));
-        let inflation = self.belief.inflation(&self.window.cameras).unwrap_or(1.0);
-        let is_plain = |adjusted: &&AdjustedCameras| !is_suspicious(adjusted, inflation);
-        if let Some(adjusted) = fitting.filter(is_plain) {
+        if let Some(adjusted) = fitting.filter(|adjusted| !is_suspicious(adjusted)) {
             return WindowUpdate::Accepted(Box::new(self.learnt(self.belief.clone(), adjusted)));
         }
         // Try a jump within the window first, then for each suspect a jump before it, at a price.
@@ -86,42 +88,53 @@ impl JumpTest<'_> {
         {
             return WindowUpdate::Accepted(Box::new(belief));
         }
-        let mut best = fitting.map(|adjusted| (adjusted.clone(), self.belief.clone()));
-        // A jump makes the residuals repeat that do not allow for it: earlier windows tell how far
-        // they do otherwise.
-        let without_jump = plain.as_ref().map_or(1.0, |adjusted| adjusted.inflation);
-        let usual = self.belief.inflation(&self.window.cameras).unwrap_or(without_jump);
+        // A fit without a jump sets the evidence to beat, even where it is a bad fit.
+        let evidence = plain.as_ref().map_or(f64::NEG_INFINITY, |adjusted| adjusted.evidence);
+        let unmoved = fitting.map(|adjusted| self.learnt(self.belief.clone(), adjusted));
+        let mut best = (evidence, unmoved);
         for camera in suspects {
             let mut doubting = self.belief.clone();
             doubting.doubt_jumped(camera);
-            let Some(adjusted) = adjust(&doubting, self.window, &self.components).filter(fits)
-            else {
+            let Some(adjusted) = self.fit(&doubting, self.window).filter(fits) else {
                 continue;
             };
             // The prior probability of a jump, as a price on the evidence.
-            // Evidence of bearings that repeat one another is overstated as their information is. A
-            // clock that is free fits their errors too, and hides that they repeat.
-            let inflation = adjusted.inflation.max(usual);
-            let evidence = adjusted.evidence - JUMP * inflation;
-            if best.as_ref().is_none_or(|(best, _)| evidence > best.evidence) {
-                best = Some((AdjustedCameras { evidence, ..adjusted }, doubting));
+            let evidence = adjusted.evidence - JUMP;
+            let jumped = self.learnt(doubting, &adjusted);
+            if evidence > best.0 && jumped.is_possible() {
+                best = (evidence, Some(jumped));
             }
         }
-        if let Some((adjusted, belief)) = best {
-            return WindowUpdate::Accepted(Box::new(self.learnt(belief, &adjusted)));
+        if let (_, Some(belief)) = best {
+            return WindowUpdate::Accepted(Box::new(belief));
         }
         // Nothing fits: try without anything learnt before.
         self.belief.reset_all();
         self.components = components(&self.belief, self.window);
-        let anew = adjust(&self.belief, self.window, &self.components).filter(fits);
+        let anew = self.fit(&self.belief, self.window).filter(fits);
         anew.map_or(WindowUpdate::Uninformative, |adjusted| {
             WindowUpdate::Contradicts(Box::new(self.learnt(self.belief.clone(), &adjusted)))
         })
     }
 
+    /// Factors by which the bearings of the window's cameras repeat one another: as in earlier
+    /// windows, or, where a camera is new, as in a first fit.
+    fn expected_inflations(&self) -> Vec<f64> {
+        let known = self.window.cameras.iter().map(|camera| self.belief.inflation(camera));
+        let known: Vec<Option<f64>> = known.collect();
+        let first = known.iter().any(Option::is_none).then(|| self.fit(&self.belief, self.window));
+        let found = |index: usize| Some(first.as_ref()?.as_ref()?.inflations[index]);
+        let expected = |(index, known): (usize, &Option<f64>)| known.or_else(|| found(index));
+        known.iter().enumerate().map(|known| expected(known).unwrap_or(1.0)).collect()
+    }
+
+    fn fit(&self, belief: &Belief, window: &TrackWindow) -> Option<AdjustedCameras> {
+        adjust(belief, window, &self.components, &self.inflations)
+    }
+
     fn learnt(&self, mut belief: Belief, adjusted: &AdjustedCameras) -> Belief {
         belief.learn(&self.components, &adjusted.cameras, &adjusted.covariance);
-        belief.see_inflation(&self.window.cameras, adjusted.inflation);
+        belief.see_inflations(&self.window.cameras, &adjusted.inflations);
         belief
     }
 
@@ -142,15 +155,16 @@ impl JumpTest<'_> {
         let later = self.window.without_early((first + last) / 2.0, camera);
         let mut doubting = self.belief.clone();
         doubting.doubt_jumped(camera);
-        let after = adjust(&doubting, &later, &self.components).filter(fits)?;
+        let after = self.fit(&doubting, &later).filter(fits)?;
         // Both must hold: the later half fits better without the earlier one, and it does not fit
         // as well with the clock as it was.
         let much_better = plain.is_none_or(|plain| strange(&after) * BETTER < strange(plain));
-        let before = adjust(&self.belief, &later, &self.components).filter(fits);
+        let before = self.fit(&self.belief, &later).filter(fits);
         // Where nothing was known of the clock yet, the evidences are even: nothing favours the old
         // clock.
         let jumped = before.is_none_or(|before| after.evidence + EVEN > before.evidence);
-        (much_better && jumped).then(|| self.learnt(doubting, &after))
+        let learnt = self.learnt(doubting, &after);
+        (much_better && jumped && learnt.is_possible()).then_some(learnt)
     }
 
     /// The cameras of the window whose clocks may have jumped, the least fitting first.
@@ -185,16 +199,19 @@ fn fits(adjusted: &AdjustedCameras) -> bool {
         && adjusted.outlier_shares.iter().all(|share| *share < MAX_OUTLIERS)
 }
 
-/// Whether a clock may have jumped; `inflation` is the factor by which the information of the prior
-/// is overstated.
-fn is_suspicious(adjusted: &AdjustedCameras, inflation: f64) -> bool {
-    // The distance from the prior is squared, and too large by as much.
+fn is_suspicious(adjusted: &AdjustedCameras) -> bool {
     adjusted.scales.iter().any(|scale| *scale > SUSPICIOUS_SCALE)
-        || adjusted.pulled > inflation * SUSPICIOUS_PULL * adjusted.cameras.len() as f64
+        // In the mean a right prior is pulled by one per unknown at most.
+        || adjusted.pulled > SUSPICIOUS_PULL * adjusted.cameras.len() as f64
 }
 
 /// Fits a window with the belief as the prior of clocks and poses.
-fn adjust(belief: &Belief, window: &TrackWindow, components: &[usize]) -> Option<AdjustedCameras> {
+fn adjust(
+    belief: &Belief,
+    window: &TrackWindow,
+    components: &[usize],
+    inflations: &[f64],
+) -> Option<AdjustedCameras> {
     let (mean, covariance) = belief.marginal(components);
     let mut next = 0;
     let mut room = |place: Option<usize>, size: usize| {
@@ -221,5 +238,5 @@ fn adjust(belief: &Belief, window: &TrackWindow, components: &[usize]) -> Option
     let prior = ClockAndPosePrior { mean, precision, epoch_s, cameras };
     let reach = LONGEST_S + 2.0 * MAX_MARGIN_S;
     let curve = Curve::over(first, last.min(first + reach));
-    Adjustment::new(&window.sights, curve, &prior).solve(FIRST_DENSITY)
+    Adjustment::new(&window.sights, curve, &prior, inflations).solve(FIRST_DENSITY)
 }
