@@ -1,7 +1,7 @@
 //! Update of the belief about the clocks by a window: how credible it is, and whether a clock has
 //! jumped.
 
-use crossfix_message::CameraName;
+use crossfix_message::{CameraName, Timestamp};
 use nalgebra::DMatrix;
 
 use super::adjustment::{AdjustedCameras, Adjustment, ClockAndPosePrior, Unknowns};
@@ -49,6 +49,8 @@ pub(super) enum WindowUpdate {
 /// Test of a window for jumps: the belief before it, and the state components that it observes.
 struct JumpTest<'a> {
     belief: Belief,
+    /// The time of the window's last bearing.
+    now: Timestamp,
     components: Vec<usize>,
     window: &'a TrackWindow,
     /// Factors by which the bearings of its cameras repeat one another.
@@ -63,14 +65,15 @@ pub(super) fn window_update(belief: &Belief, window: &TrackWindow) -> WindowUpda
         return WindowUpdate::Uninformative;
     };
     let mut belief = belief.clone();
-    belief.advance(window.start.plus_seconds(last));
+    let now = window.start.plus_seconds(last);
+    belief.advance(now);
     let clocks = window.cameras.iter().filter(|camera| belief.place(camera).is_some()).count();
     if clocks == 0 || window.cameras.len() < 2 {
         return WindowUpdate::Uninformative;
     }
     let components = components(&belief, &window);
     let inflations = vec![1.0; window.cameras.len()];
-    JumpTest { belief, components, window: &window, inflations }.learn()
+    JumpTest { belief, now, components, window: &window, inflations }.learn()
 }
 
 impl JumpTest<'_> {
@@ -101,7 +104,7 @@ impl JumpTest<'_> {
             // The prior probability of a jump, as a price on the evidence.
             let evidence = adjusted.evidence - JUMP;
             let jumped = self.learnt(doubting, &adjusted);
-            if evidence > best.0 && jumped.is_possible() {
+            if evidence > best.0 && self.shows_jump(camera, &jumped) {
                 best = (evidence, Some(jumped));
             }
         }
@@ -164,7 +167,21 @@ impl JumpTest<'_> {
         // clock.
         let jumped = before.is_none_or(|before| after.evidence + EVEN > before.evidence);
         let learnt = self.learnt(doubting, &after);
-        (much_better && jumped && learnt.is_possible()).then_some(learnt)
+        (much_better && jumped && self.shows_jump(camera, &learnt)).then_some(learnt)
+    }
+
+    /// Whether the belief after a jump of a clock says by how much it has jumped. Where the bearings
+    /// of a camera are moved to a time at which no other camera sees the target, they fit whatever
+    /// they are, and their clock is as unknown as before: that explains nothing.
+    fn shows_jump(&self, camera: &CameraName, jumped: &Belief) -> bool {
+        let offset = |belief: &Belief| belief.estimate(camera, self.now);
+        let (Some(before), Some(after)) = (offset(&self.belief), offset(jumped)) else {
+            return false;
+        };
+        // Wald's test, d^2 / var(d) > 18: for one normal parameter it is the ratio of likelihoods
+        // that a jump must reach anyway.
+        let change_s = after.offset_s - before.offset_s;
+        jumped.is_possible() && change_s.powi(2) > JUMP * after.relative_sd_s.powi(2)
     }
 
     /// The cameras of the window whose clocks may have jumped, the least fitting first.
