@@ -12,6 +12,7 @@ use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::{CameraName, Cued, Solver, Timestamp, TrackNumber};
 use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Point3};
 
+use crate::cameras::ThirdDifferences;
 use crate::cueing::CueTarget;
 use crate::motion::{
     ManoeuvreDetector, MotionSetup, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD,
@@ -82,8 +83,8 @@ pub struct MeasurementResidual {
 pub(crate) struct Taken {
     /// Whether a manoeuvre detector has fired.
     pub(crate) manoeuvre: bool,
-    /// Squared third difference of the camera's last four bearings, in units of the reported noise.
-    pub(crate) third_difference: Option<f64>,
+    /// What the camera's last bearings show of their noise.
+    pub(crate) third_differences: Option<ThirdDifferences>,
 }
 
 /// A 3D track of one target, updated by single bearings of single cameras.
@@ -401,8 +402,8 @@ impl Track {
         self.held = self.ties.values().filter(lately).count() >= 2;
         self.range_again(line, motion);
         self.gather(camera, &innovation, line, uncertainty);
-        let third_difference = self.third_difference(camera, line, motion);
-        Some(Taken { manoeuvre, third_difference })
+        let third_differences = self.third_differences(camera, line, motion);
+        Some(Taken { manoeuvre, third_differences })
     }
 
     /// Checks whether two cameras still see the target. When that ends, one camera alone has been

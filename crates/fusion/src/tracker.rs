@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use crossfix_filter::{Gate, KinematicState};
 use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 
-use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, ScaleSample};
+use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, ScaleSample, ThirdDifferences};
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::reacquisition::{Reacquisition, ReacquisitionContext};
@@ -59,7 +59,7 @@ pub(crate) struct Tracker {
 struct Noted {
     changes: Vec<TrackChange>,
     fittings: Fittings,
-    third_differences: Vec<f64>,
+    third_differences: Vec<ThirdDifferences>,
 }
 
 /// Result of an exposure.
@@ -73,9 +73,8 @@ pub(crate) struct TrackerStep {
     pub(crate) used: Vec<(usize, TrackId)>,
     /// How the exposure fits the confirmed targets that other cameras see.
     pub(crate) fittings: Fittings,
-    /// Squared third differences of the camera's bearings of tracks, in units of the noise that it
-    /// reports.
-    pub(crate) third_differences: Vec<f64>,
+    /// What the camera's bearings of tracks show of their noise.
+    pub(crate) third_differences: Vec<ThirdDifferences>,
     /// Number of its sightings that no track has taken.
     pub(crate) unassigned: usize,
     pub(crate) changes: Vec<TrackChange>,

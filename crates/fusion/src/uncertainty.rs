@@ -168,8 +168,11 @@ pub(crate) struct CameraUncertainty {
     pub(crate) clock_source: ClockSource,
     /// Random walk of the clock beside its offset and its drift, s^2/s.
     pub(crate) clock_walk: f64,
-    /// The part of its bearings' noise that lasts.
+    /// The part of its bearings' noise that lasts, as declared or, where nobody has declared it, as
+    /// learnt.
     pub(crate) lasting: CorrelatedNoise,
+    /// The same as declared.
+    pub(crate) declared_lasting: CorrelatedNoise,
     /// Rotation from camera to world axes: the shared errors keep to the camera's axes.
     pub(crate) axes: Rotation3<f64>,
 }
@@ -186,6 +189,7 @@ impl CameraUncertainty {
             clock_source: ClockSource::Unspecified,
             clock_walk: 0.0,
             lasting: CorrelatedNoise::NONE,
+            declared_lasting: CorrelatedNoise::NONE,
             axes: Rotation3::identity(),
         }
     }
@@ -292,6 +296,7 @@ mod tests {
             clock_source: ClockSource::Ntp,
             clock_walk: 0.0,
             lasting: CorrelatedNoise::NONE,
+            declared_lasting: CorrelatedNoise::NONE,
             axes: Rotation3::identity(),
         };
         // 10 m/s along the first tangent: 0.2 rad/s.

@@ -49,6 +49,7 @@ impl KnownCamera {
             pose: Some(PoseUncertainty::new(self.pose_covariance)),
             clock_walk: self.clock_walk,
             lasting: self.lasting,
+            declared_lasting: self.lasting,
             axes: *self.camera.pose().rotation(),
             ..CameraUncertainty::of_time(0.0)
         }

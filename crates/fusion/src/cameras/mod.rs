@@ -31,9 +31,10 @@ use crossfix_message::{CameraName, Timestamp};
 use crossfix_message::ClockSource;
 
 use crate::Exposure;
+use crate::uncertainty::CorrelatedNoise;
 use calibration::Calibrations;
 use clutter::ClutterRate;
-use noise::WhiteNoise;
+use noise::BearingNoise;
 use pose_scale::PoseScale;
 use rooted::ReportedPlaces;
 use standing::Standing;
@@ -41,7 +42,7 @@ use watch::ErrorWatch;
 
 pub(crate) use calibration::KnownCamera;
 pub(crate) use clutter::view_sr;
-pub(crate) use noise::LastThree;
+pub(crate) use noise::{RecentBearings, ThirdDifferences};
 pub(crate) use pointing::Pointed;
 pub(crate) use pose_scale::ScaleSample;
 pub(crate) use rooted::Rooted;
@@ -85,7 +86,7 @@ pub(crate) struct CameraState {
     /// Where its mount pointed in its newest exposure, and the camera turned there.
     pointed: Option<(Pointed, KnownCamera)>,
     pose_scale: PoseScale,
-    noise: WhiteNoise,
+    noise: BearingNoise,
     clutter: ClutterRate,
     view: ReportedPlaces,
     told_clock: Option<ToldClock>,
@@ -103,7 +104,7 @@ impl CameraState {
             pose_scale: PoseScale::new(known.is_declared),
             calibrations: Calibrations::first(known),
             pointed: None,
-            noise: WhiteNoise::default(),
+            noise: BearingNoise::default(),
             clutter: ClutterRate::default(),
             view: ReportedPlaces::new(rooted_s),
             told_clock: None,
@@ -136,9 +137,14 @@ impl CameraState {
         has_turned
     }
 
-    /// Factor on its reported covariances.
+    /// Ratio of the covariance of its bearings' white noise to what they report.
     pub(crate) fn noise_factor(&self) -> f64 {
-        self.noise.factor()
+        if self.known().lasting != CorrelatedNoise::NONE {
+            // Somebody has divided the noise into its parts: the bearings report the white one.
+            self.noise.white().max(1.0)
+        } else {
+            self.noise.white()
+        }
     }
 
     /// How far the camera is believed.
@@ -162,7 +168,10 @@ impl CameraState {
     /// is assumed.
     pub(crate) fn tell(&mut self, exposure: &mut Exposure, clutter_per_sr: f64) {
         exposure.uncertainty.pose_scale = self.pose_scale.factor();
-        exposure.uncertainty.factor = self.noise.factor();
+        exposure.uncertainty.factor = self.noise_factor();
+        if exposure.uncertainty.declared_lasting == CorrelatedNoise::NONE {
+            exposure.uncertainty.lasting = self.noise.lasting();
+        }
         exposure.clutter_per_sr = self.clutter.per_sr(self.known()).unwrap_or(clutter_per_sr);
         let lines = exposure.sightings.iter().map(|sighting| &sighting.line);
         let rooted = self.view.see(exposure.time, lines);
@@ -197,15 +206,15 @@ impl CameraState {
         known.then_some(ClockChange { ahead, ratio })
     }
 
-    /// Takes in squared third differences of the camera's bearings of tracks, and the number of
+    /// Takes in third differences of the camera's bearings of tracks, and the number of
     /// its unassigned bearings in an exposure (clutter). A bearing holds a track for `holding_s`.
     pub(crate) fn learn_noise(
         &mut self,
         time: Timestamp,
-        (third_differences, unassigned): (&[f64], usize),
+        (third_differences, unassigned): (&[ThirdDifferences], usize),
         holding_s: f64,
     ) {
-        third_differences.iter().for_each(|squared| self.noise.see(*squared));
+        third_differences.iter().for_each(|differences| self.noise.see(differences));
         self.clutter.see(time, unassigned, holding_s);
     }
 
@@ -222,7 +231,7 @@ impl CameraState {
         self.pointed = None;
         let known = self.known();
         self.pose_scale = PoseScale::new(known.is_declared);
-        self.noise = WhiteNoise::default();
+        self.noise = BearingNoise::default();
         self.view = self.view.anew();
         self.told_clock = None;
     }

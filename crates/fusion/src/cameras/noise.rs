@@ -1,46 +1,103 @@
-//! White noise of a camera's bearings from one exposure to the next, relative to what it reports.
+//! Noise of a camera's bearings, relative to what it reports: the white part, which every bearing
+//! draws anew, and the part that lasts from one bearing to the next.
 //!
 //! In the third difference of four bearings of one target its direction, its rate and its turning
-//! cancel, and whatever pose, clock and slow errors shift all four by: what is left is four draws
-//! of white noise. So it separates the white part of a camera's noise from all else, whatever the
-//! track believes.
+//! cancel, and whatever pose, clock and slow errors shift all four by. What is left of four
+//! successive bearings is four draws of white noise. Of four bearings that are a quarter of a second
+//! apart there is left, in addition, what a lasting error changes by within that time. So the two
+//! together tell the white part of a camera's noise from the lasting part, whatever the track
+//! believes.
 
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector2, Vector3};
 
+use crate::uncertainty::CorrelatedNoise;
+
 /// Median of a chi-square of two degrees of freedom.
 const MEDIAN: f64 = 1.386_294;
 /// Increase of the share of draws below the median per unit of the logarithm of the scale.
 const SLOPE: f64 = 0.346_574;
-/// Number of draws that the estimate remembers: it is then known to 10 %. With half as many a
+/// Number of draws that the estimate remembers: it is then known to 13 %. With half as many a
 /// camera must report a third of its variance before that is noticed, and not half of it.
 const MEMORY: f64 = 200.0;
 /// Standard error of the logarithm of the scale after one draw (simulated: neighbouring draws share
 /// three of their four bearings).
 const ERROR_OF_ONE: f64 = 1.9;
-/// A camera whose scale is this many standard errors above what it reports is no longer taken at
+/// A camera whose scale is this many standard errors from what it reports is no longer taken at
 /// its word. With half as many one in four is doubted by chance before its first two hundred draws
 /// are over.
 const DOUBT: f64 = 3.0;
+/// The least share of the reported variance that counts as white. Labels that are interpolated, and
+/// trackers that smooth, have none at all; with a tenth of this their bearings would be believed
+/// more closely than a lens is known from one pixel to the next.
+const LEAST_WHITE: f64 = 0.01;
+/// Least interval between the bearings of a spaced third difference, s. With half of it an error
+/// that lasts for a second must be six times as large to be seen beside white noise; with twice as
+/// much the turns of a small drone are taken for errors.
+const SPACING_S: f64 = 0.25;
+/// Correlation time of the part that lasts, where nobody has declared it, s. From the spaced
+/// differences only the rate of change of the error follows, variance over time, and not each for
+/// itself: with half of the time the variance found is half as large, and the rate is the same.
+const LASTING_S: f64 = 1.0;
 
-/// The last three bearings that a camera gave of a track.
+/// Squared third differences of a camera's bearings of a target, over their variance by the
+/// reported noise (two degrees of freedom each, if that is right).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct ThirdDifferences {
+    /// Of the last four bearings.
+    pub(crate) successive: Option<f64>,
+    /// Of four bearings [`SPACING_S`] apart.
+    pub(crate) spaced: Option<f64>,
+    /// Variance that the newest bearing reports, rad^2 per tangent.
+    pub(crate) reported: f64,
+}
+
+/// The last bearings that a camera gave of a track.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct LastThree([Option<(Timestamp, Unit<Vector3<f64>>)>; 3]);
+pub(crate) struct RecentBearings {
+    successive: LastThree,
+    spaced: LastThree,
+}
 
-impl LastThree {
-    /// Takes in a bearing; returns the squared third difference of it and the three before, over
-    /// its variance by the reported noise (two degrees of freedom where that is right), provided
-    /// that no two successive ones are more than `longest_s` apart. `expected` is the direction in
-    /// which the track has the target at a time.
+impl RecentBearings {
+    /// Takes in a bearing; returns what it and those before it show of the noise. Of successive
+    /// bearings no two may be more than `longest_s` apart. `expected` is the direction in which the
+    /// track has the target at a time.
     pub(crate) fn see(
         &mut self,
         time: Timestamp,
         line: &SightLine,
         longest_s: f64,
         expected: impl Fn(Timestamp) -> Option<Unit<Vector3<f64>>>,
+    ) -> ThirdDifferences {
+        ThirdDifferences {
+            successive: self.successive.see(time, line, (0.0, longest_s), &expected),
+            spaced: self.spaced.see(time, line, (SPACING_S, 2.0 * SPACING_S), &expected),
+            reported: line.covariance.trace() / 2.0,
+        }
+    }
+}
+
+/// Three bearings of a camera.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct LastThree([Option<(Timestamp, Unit<Vector3<f64>>)>; 3]);
+
+impl LastThree {
+    /// Takes in a bearing if it is at least `least_s` later than the one before; returns the squared
+    /// third difference of it and the three before, over its variance by the reported noise, provided
+    /// that no two successive ones are more than `longest_s` apart.
+    fn see(
+        &mut self,
+        time: Timestamp,
+        line: &SightLine,
+        (least_s, longest_s): (f64, f64),
+        expected: impl Fn(Timestamp) -> Option<Unit<Vector3<f64>>>,
     ) -> Option<f64> {
         let [first, second, third] = self.0;
+        if third.is_some_and(|(before, _)| (0.0..least_s).contains(&time.seconds_since(before))) {
+            return None;
+        }
         self.0 = [second, third, Some((time, line.direction))];
         let seen = [first?, second?, third?, (time, line.direction)];
         let ages = seen.map(|(then, _)| time.seconds_since(then));
@@ -64,17 +121,17 @@ impl LastThree {
     }
 }
 
-/// Factor on a camera's reported covariances, from a running median of its squared third
-/// differences: one bearing in ten may be of no target.
+/// Ratio of a noise to the reported one, from a running median of squared third differences: one
+/// bearing in ten may be of no target.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct WhiteNoise {
+struct RunningScale {
     log_factor: f64,
     draws: f64,
 }
 
-impl WhiteNoise {
+impl RunningScale {
     /// Takes a squared third difference in.
-    pub(crate) fn see(&mut self, squared: f64) {
+    fn see(&mut self, squared: f64) {
         self.draws = (self.draws + 1.0).min(MEMORY);
         // A step towards the median, up or down: half a draw over the slope and the number of
         // draws.
@@ -82,12 +139,55 @@ impl WhiteNoise {
         self.log_factor += above / (SLOPE * self.draws.max(10.0));
     }
 
-    /// Ratio of the noise's covariance to the reported one; 1 as long as that is not clear, and
-    /// where it is less: a reported covariance also covers errors that last longer than four
-    /// pictures.
-    pub(crate) fn factor(&self) -> f64 {
-        // ln f > DOUBT standard errors, each ERROR_OF_ONE / sqrt(n).
-        let is_clear = self.log_factor * self.draws.sqrt() > DOUBT * ERROR_OF_ONE;
+    /// The ratio; 1 as long as it is not clear that it differs.
+    fn factor(&self) -> f64 {
+        // |ln f| > DOUBT standard errors, each ERROR_OF_ONE / sqrt(n).
+        let is_clear = self.log_factor.abs() * self.draws.sqrt() > DOUBT * ERROR_OF_ONE;
         if is_clear { self.log_factor.exp() } else { 1.0 }
+    }
+
+    /// The largest ratio that the draws allow: [`DOUBT`] standard errors above the estimate.
+    fn most(&self) -> f64 {
+        (self.log_factor + DOUBT * ERROR_OF_ONE / self.draws.sqrt()).exp()
+    }
+}
+
+/// The noise of a camera's bearings, as their third differences show it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct BearingNoise {
+    successive: RunningScale,
+    spaced: RunningScale,
+    /// Mean of the variances that the bearings report, rad^2 per tangent.
+    reported: f64,
+    bearings: f64,
+}
+
+impl BearingNoise {
+    /// Takes the third differences that a bearing has completed in.
+    pub(crate) fn see(&mut self, differences: &ThirdDifferences) {
+        differences.successive.into_iter().for_each(|squared| self.successive.see(squared));
+        differences.spaced.into_iter().for_each(|squared| self.spaced.see(squared));
+        self.bearings = (self.bearings + 1.0).min(MEMORY);
+        self.reported += (differences.reported - self.reported) / self.bearings;
+    }
+
+    /// Ratio of the white noise's covariance to the reported one; 1 as long as that is not clear.
+    pub(crate) fn white(&self) -> f64 {
+        self.successive.factor().max(LEAST_WHITE)
+    }
+
+    /// The part of the noise that lasts: what the reported variance holds beside the white part, as
+    /// far as it changes as quickly as the spaced third differences allow. What lasts longer than
+    /// that shifts all bearings of the camera, as its pose does, and is in the pose's covariance.
+    pub(crate) fn lasting(&self) -> CorrelatedNoise {
+        let white = self.white();
+        // The third difference of a process of variance c^2 with the correlations p, p^2, p^3
+        // between four values has the variance c^2 (20 - 30 p + 12 p^2 - 2 p^3); of white noise w it
+        // has 20 w.
+        let kept = (-SPACING_S / LASTING_S).exp();
+        let share = 1.0 - 1.5 * kept + 0.6 * kept.powi(2) - 0.1 * kept.powi(3);
+        let changing = (self.spaced.most() - white).max(0.0) / share;
+        let variance = (1.0 - white).max(0.0).min(changing) * self.reported;
+        CorrelatedNoise { sd_rad: variance.sqrt(), time_s: LASTING_S }
     }
 }

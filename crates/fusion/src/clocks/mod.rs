@@ -301,7 +301,7 @@ impl ClockEstimator {
         let is_new = !self.windows[index].cameras.contains(camera);
         let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
         let window = &mut self.windows[index];
-        let line = (*line, exposure.uncertainty.lasting);
+        let line = (*line, exposure.uncertainty.declared_lasting);
         window.add(camera, role, time, line, track.position_at(exposure.time).coords);
     }
 

@@ -11,7 +11,7 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Unit, Vector2, Vector3};
 
 use super::learnt::LearntTies;
 use super::{BearingInnovation, Track};
-use crate::cameras::{ClockChange, LastThree, ScaleSample};
+use crate::cameras::{ClockChange, RecentBearings, ScaleSample, ThirdDifferences};
 use crate::motion::MotionSetup;
 use crate::uncertainty::{
     CameraUncertainty, CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies,
@@ -66,7 +66,7 @@ pub(super) struct Ties {
     seen: Option<Timestamp>,
     /// ... and the interval to the one before, s.
     period_s: f64,
-    pub(super) last_three: LastThree,
+    pub(super) recent: RecentBearings,
     pub(super) drawn: Option<Drawn>,
     /// The same for what it has seen beside the target, when it has not seen the target itself.
     beside: Option<Drawn>,
@@ -162,7 +162,7 @@ impl Ties {
             visibility: Visibility::new(time),
             seen: None,
             period_s: 0.0,
-            last_three: LastThree::default(),
+            recent: RecentBearings::default(),
             drawn: None,
             beside: None,
             steady: (Vector2::zeros(), 0),
@@ -185,7 +185,7 @@ impl Ties {
     pub(super) fn step_time(&mut self, step_s: f64) {
         self.visibility.step_time(step_s);
         self.seen = self.seen.map(|seen| seen.plus_seconds(step_s));
-        self.last_three = LastThree::default();
+        self.recent = RecentBearings::default();
     }
 
     /// Time since the camera's last bearing of the track, s; `None` if there was none.
@@ -340,7 +340,7 @@ impl Track {
         self.renew(camera);
         let learns = self.learns(camera);
         if let Some(ties) = self.ties.get_mut(camera) {
-            ties.last_three = LastThree::default();
+            ties.recent = RecentBearings::default();
             if !learns {
                 ties.covariance.fixed_columns_mut::<2>(LASTING).fill(0.0);
                 ties.learnt.fixed_columns_mut::<2>(LASTING).fill(0.0);
@@ -350,19 +350,19 @@ impl Track {
 
     /// The squared third difference of the camera's last four bearings from the predicted
     /// directions, in units of the reported noise; `None` if they are too far apart.
-    pub(super) fn third_difference(
+    pub(super) fn third_differences(
         &mut self,
         camera: &CameraName,
         line: &SightLine,
         motion: &MotionSetup,
-    ) -> Option<f64> {
+    ) -> Option<ThirdDifferences> {
         let (now, state) = (self.updated, self.imm.combined());
         let (place, velocity) = (state.position(), state.velocity());
         let expected = |time: Timestamp| {
             Unit::try_new(place + velocity * time.seconds_since(now) - line.origin, 1e-6)
         };
-        let last_three = &mut self.ties.get_mut(camera)?.last_three;
-        last_three.see(now, line, motion.holding_s * CLOSE_BEARINGS, expected)
+        let recent = &mut self.ties.get_mut(camera)?.recent;
+        Some(recent.see(now, line, motion.holding_s * CLOSE_BEARINGS, expected))
     }
 
     /// Updates what is known of all cameras' errors after a bearing has updated the models, by the

@@ -78,7 +78,7 @@ impl Tracker {
             }
             noted
                 .third_differences
-                .extend(taken.filter(|_| sure).and_then(|taken| taken.third_difference));
+                .extend(taken.filter(|_| sure).and_then(|taken| taken.third_differences));
             let silent = exposure.time.seconds_since(track.updated) > self.config.coasting_after_s;
             let detection = self.config.detection_probability;
             let visible = track.visible_to(&exposure.camera, exposure.time, &self.motion);
