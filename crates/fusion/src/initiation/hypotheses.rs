@@ -45,6 +45,8 @@ struct Hypothesis {
     track: Box<Track>,
     /// Its lines of the last periods, each with the number of its period, in order of time.
     lines: Vec<(u64, LineId)>,
+    /// Whether each camera's newest line is of something that stands in its view.
+    rooted: BTreeMap<CameraName, Rooted>,
     /// Number of periods that gave it a line.
     periods: usize,
     born: Timestamp,
@@ -84,6 +86,38 @@ impl Hypothesis {
     /// The cameras that have given it a line in the last periods.
     fn cameras(&self) -> BTreeSet<&CameraName> {
         self.lines.iter().map(|(_, (camera, ..))| camera).collect()
+    }
+
+    /// Whether what stands in the cameras' views explains it: but for one camera at most, whose line
+    /// may be clutter (of two cameras, but for none). As long as this is unknown of a line (its
+    /// camera has only begun to look), two cameras are not enough.
+    fn stands(&self) -> bool {
+        let cameras = self.cameras();
+        let newest = || self.rooted.iter().filter(|(camera, _)| cameras.contains(camera));
+        let others = newest().filter(|(_, rooted)| **rooted != Rooted::Yes).count();
+        if cameras.len() == 2 {
+            others == 0 || newest().any(|(_, rooted)| *rooted == Rooted::Unknown)
+        } else {
+            others < 2
+        }
+    }
+
+    /// Least log-likelihood ratio of one target against an object per camera with which it is
+    /// confirmed: the logarithm of the number of sets of lines that it may have been chosen from by
+    /// chance, the product of the numbers of its cameras' lines. What stands in a view is counted
+    /// where the hypothesis has such a line; one of two cameras has none, as two that stand make no
+    /// hypothesis. If none of its lines has been seen to come or to move, all may stand, and it needs
+    /// as much more as against any other rival.
+    fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
+        let cameras = self.cameras();
+        let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
+        let number = |camera: &CameraName| {
+            let may_stand = cameras.len() > 2 && rooted(camera) == Rooted::Yes;
+            lines.get(camera).map_or(1, |[all, others]| if may_stand { *all } else { *others })
+        };
+        let choices: f64 = cameras.iter().map(|camera| (number(camera).max(1) as f64).ln()).sum();
+        let moves = cameras.len() == 2 || cameras.iter().any(|camera| rooted(camera) == Rooted::No);
+        if moves { choices } else { choices + RIVAL_MARGIN }
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {
@@ -162,8 +196,8 @@ impl Hypotheses {
         self.begin(seeds, exposures, motion);
         self.prune();
         let now = exposures.last().map(|exposure| exposure.time);
-        let pairs = logarithm_of_pairs(exposures);
-        now.map_or_else(Vec::new, |now| self.confirm(now, pairs, motion))
+        let lines = numbers_of_lines(exposures);
+        now.map_or_else(Vec::new, |now| self.confirm(now, &lines, motion))
     }
 
     /// Continues every hypothesis with each bearing in its gate, and without any.
@@ -271,6 +305,7 @@ impl Hypotheses {
             );
         }
         hypothesis.lines.push((self.period, id.clone()));
+        hypothesis.rooted.insert(exposure.camera.clone(), exposure.sightings[i].rooted);
         Some(hypothesis)
     }
 
@@ -326,17 +361,22 @@ impl Hypotheses {
                 seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
             let mut one_target =
                 OneTargetTest::begin(lines, (fix.state.position(), self.speed), seed.score);
+            let mut rooted = BTreeMap::new();
             for ((camera, sequence, index), timed) in &seed.lines {
                 let seen_from = (camera, timed.line.origin);
                 let of = |exposure: &&&Exposure| {
                     exposure.camera == *camera && exposure.sequence == *sequence
                 };
-                let own =
-                    exposures.iter().find(of).and_then(|exposure| exposure.sightings.get(*index));
+                let Some(own) =
+                    exposures.iter().find(of).and_then(|exposure| exposure.sightings.get(*index))
+                else {
+                    continue;
+                };
+                rooted.insert(camera.clone(), own.rooted);
                 let expected = uncertainty.get(camera).and_then(|uncertainty| {
                     track.expectation(timed.time, seen_from, uncertainty, motion)
                 });
-                if let (Some(own), Some(TrackExpectation::Near(prediction))) = (own, expected) {
+                if let Some(TrackExpectation::Near(prediction)) = expected {
                     one_target.begin_shift(camera, &own.line, &prediction);
                 }
             }
@@ -345,6 +385,7 @@ impl Hypotheses {
                 tree: self.trees,
                 track,
                 lines,
+                rooted,
                 periods: 1,
                 born: time,
                 one_target,
@@ -370,9 +411,13 @@ impl Hypotheses {
 
     /// Confirms hypotheses: those of the best set without common lines that are likely enough and
     /// have no rival. The log-likelihood ratio of one target against a target per camera must reach
-    /// `pairs`, the logarithm of the number of pairs of lines that may look like one target by
-    /// chance.
-    fn confirm(&mut self, now: Timestamp, pairs: f64, motion: &MotionSetup) -> Vec<Start> {
+    /// the logarithm of the number of sets of lines that may look like one target by chance.
+    fn confirm(
+        &mut self,
+        now: Timestamp,
+        lines: &BTreeMap<&CameraName, [usize; 2]>,
+        motion: &MotionSetup,
+    ) -> Vec<Start> {
         // Sorted by score: the rest have scores of 0 and less, which are never chosen.
         let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
         let scored = likely.map(|h| (h.track.score, h.lines.as_slice()));
@@ -387,8 +432,12 @@ impl Hypotheses {
                     >= self.pair_s
                     && hypothesis.track.is_placed();
                 let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
-                let one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= pairs);
-                let likely = agreed && one && hypothesis.track.score >= self.tracking.confirm_score;
+                let least = hypothesis.least_one_target_ratio(lines);
+                let one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= least);
+                let likely = agreed
+                    && one
+                    && !hypothesis.stands()
+                    && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);
                     let alike = |k: usize| {
@@ -425,18 +474,15 @@ impl Hypotheses {
     }
 }
 
-/// Logarithm of the number of pairs of lines of the two cameras that see most; fixed objects in the
-/// view are not counted.
-fn logarithm_of_pairs(exposures: &[&Exposure]) -> f64 {
-    let mut lines: BTreeMap<&CameraName, usize> = BTreeMap::new();
+/// Number of lines of each camera in an exposure, the largest of the period: all, and those of which
+/// it is not known that they are of something that stands in its view.
+fn numbers_of_lines<'a>(exposures: &[&'a Exposure]) -> BTreeMap<&'a CameraName, [usize; 2]> {
+    let mut lines: BTreeMap<&CameraName, [usize; 2]> = BTreeMap::new();
     for exposure in exposures {
-        let count =
-            exposure.sightings.iter().filter(|sighting| sighting.rooted != Rooted::Yes).count();
+        let others = exposure.sightings.iter().filter(|sighting| sighting.rooted != Rooted::Yes);
+        let now = [exposure.sightings.len(), others.count()];
         let most = lines.entry(&exposure.camera).or_default();
-        *most = count.max(*most);
+        *most = [0, 1].map(|i: usize| most[i].max(now[i]));
     }
-    let mut counts: Vec<usize> = lines.into_values().collect();
-    counts.sort_unstable();
-    // ln(n1 n2), n1 and n2 the two largest counts.
-    counts.iter().rev().take(2).map(|&count| (count.max(1) as f64).ln()).sum()
+    lines
 }

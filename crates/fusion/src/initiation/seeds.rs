@@ -31,6 +31,14 @@ const MAX_FOUND: usize = 20_000;
 /// Most pairs of lines tried for two cameras: time is bounded, whatever a camera reports.
 const MAX_PAIRS: usize = 250_000;
 
+/// Up to this distance from the nearest camera new targets are as dense as `birth_density_per_m3`
+/// says, m: at a kilometre a small drone is one pixel of an ordinary camera (0.5 mrad). Beyond it
+/// the density of those that are seen falls with the cube of the distance, so that each factor of
+/// distance brings as many. With one density for all distances a site would expect thousands of
+/// targets at 10 km, and lines that cross there by chance would pass for them. With half of it
+/// targets at 3 km that hardly move when the cameras begin to look are found seconds later.
+const DENSE_M: f64 = 1000.0;
+
 /// A set of lines that may be one target's, with its solution.
 #[derive(Clone, Debug)]
 pub(crate) struct Seed {
@@ -324,10 +332,14 @@ impl SeedFinder {
         let factor = solution.state.covariance.cholesky()?;
         let log_root: f64 = factor.l().diagonal().map(f64::ln).sum();
         let velocity = 3.0 * self.initiation.velocity_prior_sd_mps.ln();
+        let ranges =
+            lines.iter().map(|(_, timed)| (solution.state.position() - timed.line.origin).norm());
+        let nearest = ranges.fold(f64::INFINITY, f64::min);
+        // ln(density min(1, (D / r)^3)).
+        let births =
+            self.initiation.birth_density_per_m3.ln() + 3.0 * (DENSE_M / nearest).ln().min(0.0);
         let mut evidence =
-            self.initiation.birth_density_per_m3.ln() + 1.5 * (2.0 * PI).ln() + log_root
-                - velocity
-                - solution.chi_square / 2.0;
+            births + 1.5 * (2.0 * PI).ln() + log_root - velocity - solution.chi_square / 2.0;
         let (position, speed) = (solution.state.position(), self.initiation.velocity_prior_sd_mps);
         // Each line: detected, with the normal density's factor 1 / (2 pi |R|^(1/2)).
         for (_, timed) in lines {
