@@ -4,7 +4,7 @@
 //! Each camera's pose error shifts its bearings of a target, whose place is not known beforehand.
 //! The residuals of the lines, with the best place taken out, tell how large the cameras' errors
 //! are, and whose: the variances are found by minorisation and maximisation of their likelihood
-//! (REML of variance components), one step per draw. Where nobody has declared a pose's deviation,
+//! (REML of variance components), one step per draw, each camera's about the site's typical one. Where nobody has declared a pose's deviation,
 //! the estimate starts from that of a careful survey. A clock that is off by more than its camera
 //! says looks like a pose that is.
 
@@ -17,13 +17,13 @@ use super::Cameras;
 /// the means remember some three seconds of one target. With half of it a site would take a minute
 /// to learn how good its poses are.
 const DRAW_SHARE: f64 = 0.1;
-/// Each step moves the cameras' variances towards their median by this share, as if one of ten
-/// draws were of an average camera: cameras of one site have been surveyed alike. So a camera whose
-/// lines happen to meet the others' is not taken to be perfect, while one that is far off loses a
-/// tenth of its error at most. Without it two of four cameras would be taken to be perfect, and the
-/// others to be worse than they are: the lines tell of fewer errors than there are. With twice as
-/// much a camera that is off by 0.2 degrees draws the others with it.
-const ALIKE: f64 = 0.1;
+/// Weight of the site's typical factor in the estimate of a camera's own, in degrees of freedom: a
+/// draw has two, less what the target's place takes of them, and a pose errs once, however many
+/// draws show it. Cameras of one site have been surveyed alike. Without it two of four cameras would
+/// be taken to be perfect, and the others to be worse than they are: the lines tell of fewer errors
+/// than there are. With 0.5 a camera that is off by 0.2 degrees draws the others with it; with half
+/// of it tracks of poses that are all equally wrong are 15 % more unsure than they say.
+const TYPICAL_WEIGHT: f64 = 0.2;
 /// Largest change of a factor (variance) in one step, so that a camera that is knocked is
 /// recognised in two seconds. With half of it that takes five, with twice as much one wrong start
 /// doubts a good camera.
@@ -100,6 +100,12 @@ impl PoseScale {
         self.told > DOUBTED
     }
 
+    /// The step that the camera's own draws alone would take: its factor's ratio to that before.
+    fn own_step(&self) -> Option<f64> {
+        let step = (self.found / self.expected).sqrt().clamp(LARGEST_STEP.recip(), LARGEST_STEP);
+        (self.expected > 0.0).then_some(step)
+    }
+
     /// Takes in the squared pose error that a draw of `accusers` cameras has found, and its
     /// expectation, with the typical factor of the site's cameras; returns by how much the tracks'
     /// factor changes, if it does.
@@ -118,12 +124,13 @@ impl PoseScale {
         let found = found.min(expected * MOST_OF_A_DRAW);
         self.found += (found - self.found) * share;
         self.expected += (expected - self.expected) * share;
-        // Minorisation-maximisation step of a variance: factor * sqrt(found / expected).
-        let step = (self.found / self.expected).sqrt().clamp(LARGEST_STEP.recip(), LARGEST_STEP);
+        // Minorisation-maximisation step of a variance with an inverse gamma prior of n degrees of
+        // freedom about the typical factor t: factor * sqrt((found + n t / factor) / (expected + n)).
+        let found = self.found + TYPICAL_WEIGHT * typical / self.value;
+        let step = (found / (self.expected + TYPICAL_WEIGHT)).sqrt();
         // Two cameras can clear each other, but not accuse.
         let most = if accusers < LEAST_ACCUSERS { 1.0 } else { LARGEST_STEP };
-        let own = self.value * step.min(most);
-        let next = own + (typical - own) * ALIKE;
+        let next = self.value * step.min(most);
         let next = next.clamp(self.value / LARGEST_STEP, self.value * LARGEST_STEP);
         let next = next.clamp(self.least, self.greatest);
         // Under the new factor the errors found so far come out smaller: not at all where noise
@@ -158,16 +165,16 @@ impl Cameras {
         changed.collect()
     }
 
-    /// Median of the cameras' factors, in their logarithms.
+    /// The typical factor of the cameras: the median of their factors times the median of the steps
+    /// that their own draws would take, both in logarithms.
     fn typical_scale(&self, samples: &[ScaleSample]) -> f64 {
-        let logarithm =
-            |sample: &ScaleSample| Some(self.get(&sample.camera)?.pose_scale.value.ln());
-        let mut logarithms: Vec<f64> = samples.iter().filter_map(logarithm).collect();
-        logarithms.sort_unstable_by(f64::total_cmp);
-        let middle = |k: usize| logarithms.get(k).copied().unwrap_or(0.0);
-        // Median of the logarithms; of an even number, the mean of the middle two.
-        ((middle(logarithms.len() / 2) + middle(logarithms.len().saturating_sub(1) / 2)) / 2.0)
-            .exp()
+        let scales = || {
+            let of = |sample: &ScaleSample| Some(&self.get(&sample.camera)?.pose_scale);
+            samples.iter().filter_map(of)
+        };
+        let value = median(scales().map(|scale| scale.value.ln()).collect());
+        let step = median(scales().filter_map(|scale| Some(scale.own_step()?.ln())).collect());
+        (value + step).exp()
     }
 
     /// For each camera, by its factor: the squared pose error that explains its part of a draw, and
@@ -195,6 +202,13 @@ impl Cameras {
         };
         Some(samples.iter().zip(&weights).map(of_camera).collect())
     }
+}
+
+/// The median; of an even number of values, the mean of the middle two, and 0 of none.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_unstable_by(f64::total_cmp);
+    let middle = |k: usize| values.get(k).copied().unwrap_or(0.0);
+    (middle(values.len() / 2) + middle(values.len().saturating_sub(1) / 2)) / 2.0
 }
 
 impl ScaleSample {
