@@ -182,3 +182,53 @@ fn what_two_cameras_see_one_after_the_other_is_one_target_only_if_it_is() {
     assert!(crossings > 2000, "{crossings}");
     assert_eq!(ghosts, 0, "of 40");
 }
+
+/// Points that stand near the horizon of one camera, up to four degrees above it and 2 km away.
+fn horizon_of(eye: &common::Eye, count: usize, rng: &mut ChaCha8Rng) -> Vec<Path> {
+    let origin = eye.camera.pose().position();
+    let ahead = eye.camera.pose().rotation().matrix().column(2).into_owned();
+    (0..count)
+        .map(|_| {
+            let azimuth = ahead.y.atan2(ahead.x) + rng.random_range(-0.45..0.45_f64);
+            let elevation = rng.random_range(0.005..0.07_f64);
+            let level = elevation.cos();
+            let towards =
+                Vector3::new(level * azimuth.cos(), level * azimuth.sin(), elevation.sin());
+            straight((origin + towards * 2000.0).coords.into(), [0.0; 3])
+        })
+        .collect()
+}
+
+/// Eight things stand near the horizon of each of three cameras, other ones in each. Some of their
+/// 512 sets of lines cross within what poses are known to, and stay so for as long as one looks.
+#[test]
+fn what_stands_near_the_horizon_of_each_camera_is_no_target_and_what_flies_before_it_is() {
+    let (mut found_s, mut ghosts) = (Vec::new(), 0);
+    for seed in 0..16 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let eyes = quick_site();
+        let flight = || straight([-20.0, -10.0, 45.0], [4.0, 2.0, 0.0]);
+        let mut frames: Vec<BearingFrame> = Vec::new();
+        for eye in &eyes {
+            let paths = horizon_of(eye, 8, &mut rng).into_iter().chain([flight()]).collect();
+            let scene = Scene { eyes: vec![eye.clone()], clutter: 0.5, ..Scene::new(paths, 6.0) };
+            frames.extend(scene.frames(seed));
+        }
+        frames.sort_by_key(|frame| frame.capture_time_ns);
+        let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
+        for eye in &eyes {
+            // A careful survey, which the poses are better than.
+            fusion.calibrate(&common::calibration(eye).with_pose_sd(1e-3, 0.05)).unwrap();
+        }
+        for frame in &frames {
+            fusion.ingest(frame);
+            if found(&fusion, &flight()).is_some() && found_s.len() as u64 == seed {
+                found_s.push(frame.capture_time_ns as f64 / 1e9);
+            }
+        }
+        ghosts += fusion.tracks().filter(|track| track.is_confirmed()).count() - 1;
+    }
+    assert_eq!(ghosts, 0);
+    assert_eq!(found_s.len(), 16);
+    assert!(found_s.iter().all(|seconds| *seconds < 1.0), "{found_s:?}");
+}

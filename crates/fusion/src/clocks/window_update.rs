@@ -257,3 +257,6 @@ fn adjust(
     let curve = Curve::over(first, last.min(first + reach));
     Adjustment::new(&window.sights, curve, &prior, inflations).solve(FIRST_DENSITY)
 }
+
+#[cfg(test)]
+mod tests;
