@@ -142,24 +142,31 @@ struct Asked {
 /// Poses and clocks come from the flight's first half. The fit's residual is declared as the poses'
 /// deviation, and as that of the clocks the time in which the drone moves by as much. The limits are
 /// what is reached now and a little more: they guard it, and do not say that it is good.
-const ASKED: [Asked; 3] = [
+const ASKED: [Asked; 4] = [
     Asked {
         dataset: "3",
         cameras: "gopro3,sony5100,sonyG",
         instants: 420,
-        most: [0.114, 0.42, 4.0],
+        most: [0.114, 0.34, 2.5],
     },
     Asked {
         dataset: "3",
         cameras: "gopro3,mate7,mate10,sony5n_1440x1080,sony5100,sonyG",
         instants: 1026,
-        most: [0.195, 0.6, 5.0],
+        most: [0.195, 0.48, 4.0],
     },
     Asked {
         dataset: "1",
         cameras: "iphone6,p20pro,sonyG,sony5n_1920x1080",
         instants: 240,
-        most: [0.105, 0.28, 5.0],
+        most: [0.105, 0.25, 5.0],
+    },
+    // A lens that is 11 mrad wrong in a corner, and one camera that sees the drone alone for seconds.
+    Asked {
+        dataset: "3",
+        cameras: "gopro3,mate7,sony5n_1440x1080",
+        instants: 409,
+        most: [0.21, 0.8, 5.0],
     },
 ];
 
