@@ -87,7 +87,7 @@ impl Fusion {
         config.validate()?;
         let motion = MotionSetup::new(&config.tracking)?;
         Ok(Self {
-            cameras: Cameras::new(config.tracking.coasting_after_s),
+            cameras: Cameras::new(&config),
             buffer: EventBuffer::new(config.event_time.clone()),
             tracker: Tracker::new(config.tracking.clone(), config.initiation.max_range_m, motion),
             initiator: Initiator::new(&config),

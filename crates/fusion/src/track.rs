@@ -1,4 +1,5 @@
 mod expectation;
+mod information;
 mod innovation;
 mod learnt;
 mod past;
@@ -10,14 +11,14 @@ use std::fmt;
 use crossfix_filter::{Imm, KinematicState};
 use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::{CameraName, Cued, Solver, Timestamp, TrackNumber};
-use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Point3};
+use nalgebra::{Matrix2, Matrix2x6, Matrix6, Point3};
 
 use crate::cameras::ThirdDifferences;
 use crate::cueing::CueTarget;
 use crate::motion::{
     ManoeuvreDetector, MotionSetup, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD,
 };
-use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
+use crate::spatial::{Fix, Observability, TimedLine};
 use crate::uncertainty::CameraUncertainty;
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
 use crate::visibility::Visibility;
@@ -32,15 +33,6 @@ use ties::Ties;
 /// the range (root of the summed variances of the axes): nearly parallel lines of two different
 /// targets cross too.
 const MAX_PAIR_SHARE: f64 = 0.03;
-/// How often a track's observability is computed again, s: the eigenvalues cost more than an
-/// update.
-const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
-/// Time constant with which the Fisher information of past bearings fades, s.
-const INFORMATION_S: f64 = 1.0;
-/// Prior scale of the position in the observability test, m: a position counts as observable if it
-/// is known better than this.
-const POSITION_SCALE_M: f64 = 20.0;
-
 /// Identity of a 3D track, unique across restarts: see [`crossfix_message::track_id`]. Displayed as
 /// the track's number within its run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -387,7 +379,7 @@ impl Track {
         }
         // The errors outside the state are carried once, with the mean of all models' updates.
         let nis = self.carry((camera, uncertainty.lasting), (time, interval), &results);
-        self.gather_information(interval, line, uncertainty);
+        self.gather_information((camera, interval), line, uncertainty);
         self.updated = time;
         self.follower = Some(line.origin);
         self.solver = Solver::Kalman;
@@ -426,36 +418,6 @@ impl Track {
         }
     }
 
-    /// Adds a bearing's Fisher information to that of the recent bearings, which is carried to the
-    /// new time and faded with [`INFORMATION_S`].
-    fn gather_information(
-        &mut self,
-        interval: f64,
-        line: &SightLine,
-        uncertainty: &CameraUncertainty,
-    ) {
-        let old = &self.information;
-        let block = |row: usize, column: usize| old.fixed_view::<3, 3>(row, column).into_owned();
-        let (places, ties, speeds) = (block(0, 0), block(0, 3), block(3, 3));
-        // Information to the new time: I <- F^-T I F^-1 with F^-1 = [1, -dt; 0, 1].
-        let tied = ties - places * interval;
-        let moved = speeds - (ties + ties.transpose()) * interval + places * interval.powi(2);
-        let mut next = Matrix6::zeros();
-        next.fixed_view_mut::<3, 3>(0, 0).copy_from(&places);
-        next.fixed_view_mut::<3, 3>(0, 3).copy_from(&tied);
-        next.fixed_view_mut::<3, 3>(3, 0).copy_from(&tied.transpose());
-        next.fixed_view_mut::<3, 3>(3, 3).copy_from(&moved);
-        // Old information fades by exp(-dt / T): a bearing of long ago says little of the motion
-        // now.
-        next *= (-interval.abs() / INFORMATION_S).exp();
-        if let Some(told) = told_of_position(self.state().position(), line, uncertainty) {
-            let mut position = next.fixed_view_mut::<3, 3>(0, 0);
-            position += told;
-        }
-        self.information =
-            if next.iter().all(|value| value.is_finite()) { next } else { Matrix6::zeros() };
-    }
-
     /// Whether two cameras have lately seen the target. With only one the range is unobserved, and
     /// the track may drift along its sight line.
     pub fn is_held(&self) -> bool {
@@ -473,20 +435,6 @@ impl Track {
         self.ties.values_mut().for_each(|ties| ties.step_time(step_s));
     }
 
-    /// Computes the observability again if that was last done [`OBSERVABILITY_INTERVAL_S`] ago.
-    pub(crate) fn observe_again(&mut self) {
-        if self.updated.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
-            self.observe();
-        }
-    }
-
-    /// Computes which directions of position and velocity the recent bearings determine.
-    pub(crate) fn observe(&mut self) {
-        self.observed = self.updated;
-        self.observability =
-            Observability::of_information(&self.information, POSITION_SCALE_M, VAGUE_VELOCITY_SD);
-    }
-
     /// Whether it has been confirmed and is not lost.
     pub fn is_confirmed(&self) -> bool {
         matches!(
@@ -500,17 +448,6 @@ impl Track {
 fn log_range_sd(state: &KinematicState, origin: Point3<f64>) -> f64 {
     let away = state.position() - origin;
     (away.dot(&(state.position_covariance() * away))).max(0.0).sqrt() / away.norm_squared()
-}
-
-/// Fisher information of a bearing on the position: H' R^-1 H.
-fn told_of_position(
-    place: Point3<f64>,
-    line: &SightLine,
-    uncertainty: &CameraUncertainty,
-) -> Option<Matrix3<f64>> {
-    let model = BearingModel::new(line.origin, place)?;
-    let by = model.by_position();
-    Some(by.transpose() * (model.covariance_of(line) * uncertainty.factor).try_inverse()? * by)
 }
 
 #[cfg(test)]

@@ -171,7 +171,7 @@ pub(crate) struct CameraUncertainty {
     /// The part of its bearings' noise that lasts, as declared or, where nobody has declared it, as
     /// learnt.
     pub(crate) lasting: CorrelatedNoise,
-    /// The same as declared.
+    /// The same as declared, by the calibration or by what the mount's angles are good for.
     pub(crate) declared_lasting: CorrelatedNoise,
     /// Rotation from camera to world axes: the shared errors keep to the camera's axes.
     pub(crate) axes: Rotation3<f64>,

@@ -30,8 +30,8 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crossfix_message::ClockSource;
 
-use crate::Exposure;
 use crate::uncertainty::CorrelatedNoise;
+use crate::{Bearings, Exposure, FusionConfig, Weighting};
 use calibration::Calibrations;
 use clutter::ClutterRate;
 use noise::BearingNoise;
@@ -87,6 +87,9 @@ pub(crate) struct CameraState {
     pointed: Option<(Pointed, KnownCamera)>,
     pose_scale: PoseScale,
     noise: BearingNoise,
+    /// Whether the reported variance is of the bearings' own noise alone, so that what is not white
+    /// of it changes with them.
+    may_divide_noise: bool,
     clutter: ClutterRate,
     view: ReportedPlaces,
     told_clock: Option<ToldClock>,
@@ -99,14 +102,15 @@ pub(crate) struct CameraState {
 }
 
 impl CameraState {
-    fn new(known: KnownCamera, rooted_s: f64) -> Self {
+    fn new(known: KnownCamera, setup: CameraSetup) -> Self {
         Self {
             pose_scale: PoseScale::new(known.is_declared),
             calibrations: Calibrations::first(known),
             pointed: None,
             noise: BearingNoise::default(),
+            may_divide_noise: setup.may_divide_noise,
             clutter: ClutterRate::default(),
-            view: ReportedPlaces::new(rooted_s),
+            view: ReportedPlaces::new(setup.rooted_s),
             told_clock: None,
             standing: Standing::default(),
             misfits: Standing::default(),
@@ -137,14 +141,9 @@ impl CameraState {
         has_turned
     }
 
-    /// Ratio of the covariance of its bearings' white noise to what they report.
+    /// How many times the covariance that it reports its bearings' noise has, at least 1.
     pub(crate) fn noise_factor(&self) -> f64 {
-        if self.known().lasting != CorrelatedNoise::NONE {
-            // Somebody has divided the noise into its parts: the bearings report the white one.
-            self.noise.white().max(1.0)
-        } else {
-            self.noise.white()
-        }
+        self.noise.white().max(1.0)
     }
 
     /// How far the camera is believed.
@@ -169,7 +168,9 @@ impl CameraState {
     pub(crate) fn tell(&mut self, exposure: &mut Exposure, clutter_per_sr: f64) {
         exposure.uncertainty.pose_scale = self.pose_scale.factor();
         exposure.uncertainty.factor = self.noise_factor();
-        if exposure.uncertainty.declared_lasting == CorrelatedNoise::NONE {
+        // Where somebody has divided the noise into its parts, the bearings report the white one.
+        if self.may_divide_noise && exposure.uncertainty.declared_lasting == CorrelatedNoise::NONE {
+            exposure.uncertainty.factor = self.noise.white();
             exposure.uncertainty.lasting = self.noise.lasting();
         }
         exposure.clutter_per_sr = self.clutter.per_sr(self.known()).unwrap_or(clutter_per_sr);
@@ -246,19 +247,33 @@ pub(crate) struct Judgement {
     pub(crate) suspects_clock: bool,
 }
 
+/// What holds for all cameras.
+#[derive(Clone, Copy, Debug)]
+struct CameraSetup {
+    /// What stays in one place for this long is rooted, s.
+    rooted_s: f64,
+    /// See [`CameraState::may_divide_noise`]: not if all bearings count alike, or if what pose and
+    /// lens leave unmodelled is counted in.
+    may_divide_noise: bool,
+}
+
 /// Everything that is known of the cameras, by name.
 #[derive(Clone, Debug)]
 pub(crate) struct Cameras {
     by_name: BTreeMap<CameraName, CameraState>,
-    /// What stays in one place for this long is rooted, s.
-    rooted_s: f64,
+    setup: CameraSetup,
     watch: ErrorWatch,
 }
 
 impl Cameras {
-    /// No camera is known yet. What stays in one place for `rooted_s` is rooted.
-    pub(crate) fn new(rooted_s: f64) -> Self {
-        Self { by_name: BTreeMap::new(), rooted_s, watch: ErrorWatch::default() }
+    /// No camera is known yet.
+    pub(crate) fn new(config: &FusionConfig) -> Self {
+        let Bearings { weighting, systematic_sd_rad, .. } = config.bearings;
+        let setup = CameraSetup {
+            rooted_s: config.tracking.coasting_after_s,
+            may_divide_noise: weighting == Weighting::Reported && systematic_sd_rad == 0.0,
+        };
+        Self { by_name: BTreeMap::new(), setup, watch: ErrorWatch::default() }
     }
 
     /// Adds a camera, or a calibration of it that holds from a capture time on. The first
@@ -271,7 +286,7 @@ impl Cameras {
     ) {
         match self.by_name.entry(name) {
             Entry::Vacant(place) => {
-                place.insert(CameraState::new(known, self.rooted_s));
+                place.insert(CameraState::new(known, self.setup));
             }
             Entry::Occupied(mut place) => place.get_mut().calibrations.expect(valid_from, known),
         }

@@ -132,6 +132,8 @@ impl LastThree {
 struct RunningScale {
     log_factor: f64,
     draws: f64,
+    /// Whether it has been found to be below 1, and is not yet as good as 1 again.
+    is_less: bool,
 }
 
 impl RunningScale {
@@ -141,14 +143,23 @@ impl RunningScale {
         // A step towards the median, up or down: half a draw over the slope and the number of
         // draws.
         let above = if squared > MEDIAN * self.log_factor.exp() { 0.5 } else { -0.5 };
-        self.log_factor += above / (SLOPE * self.draws.max(10.0));
+        let next = self.log_factor + above / (SLOPE * self.draws.max(10.0));
+        // Of labels that are interpolated all draws are next to nothing: what is below the least
+        // that counts is not remembered.
+        self.log_factor = next.max(LEAST_WHITE.ln());
+        let least = if self.is_less { DOUBT } else { DIVIDED };
+        self.is_less = self.standard_errors() < -least;
+    }
+
+    /// The logarithm of the ratio in its standard errors, each [`ERROR_OF_ONE`] / sqrt(n).
+    fn standard_errors(&self) -> f64 {
+        self.log_factor * self.draws.sqrt() / ERROR_OF_ONE
     }
 
     /// The ratio; 1 as long as it is not clear that it differs.
     fn factor(&self) -> f64 {
-        // ln f in standard errors, each ERROR_OF_ONE / sqrt(n).
-        let errors = self.log_factor * self.draws.sqrt() / ERROR_OF_ONE;
-        if errors > DOUBT || errors < -DIVIDED { self.log_factor.exp() } else { 1.0 }
+        let is_clear = self.is_less || self.standard_errors() > DOUBT;
+        if is_clear { self.log_factor.exp() } else { 1.0 }
     }
 
     /// The largest ratio that the draws allow: [`DOUBT`] standard errors above the estimate.
@@ -162,8 +173,9 @@ impl RunningScale {
 pub(crate) struct BearingNoise {
     successive: RunningScale,
     spaced: RunningScale,
-    /// Mean of the variances that the bearings report, rad^2 per tangent.
-    reported: f64,
+    /// Mean of the logarithms of the variances that the bearings report (rad^2 per tangent), and
+    /// their number: a bearing that says next to nothing must not pass for the camera's usual one.
+    log_reported: f64,
     bearings: f64,
 }
 
@@ -173,12 +185,12 @@ impl BearingNoise {
         differences.successive.into_iter().for_each(|squared| self.successive.see(squared));
         differences.spaced.into_iter().for_each(|squared| self.spaced.see(squared));
         self.bearings = (self.bearings + 1.0).min(MEMORY);
-        self.reported += (differences.reported - self.reported) / self.bearings;
+        self.log_reported += (differences.reported.ln() - self.log_reported) / self.bearings;
     }
 
     /// Ratio of the white noise's covariance to the reported one; 1 as long as that is not clear.
     pub(crate) fn white(&self) -> f64 {
-        self.successive.factor().max(LEAST_WHITE)
+        self.successive.factor()
     }
 
     /// The part of the noise that lasts: what the reported variance holds beside the white part, as
@@ -192,7 +204,7 @@ impl BearingNoise {
         let kept = (-SPACING_S / LASTING_S).exp();
         let share = 1.0 - 1.5 * kept + 0.6 * kept.powi(2) - 0.1 * kept.powi(3);
         let changing = (self.spaced.most() - white).max(0.0) / share;
-        let variance = (1.0 - white).max(0.0).min(changing) * self.reported;
+        let variance = (1.0 - white).max(0.0).min(changing) * self.log_reported.exp();
         CorrelatedNoise { sd_rad: variance.sqrt(), time_s: LASTING_S }
     }
 }
@@ -279,5 +291,17 @@ mod tests {
             let bias = lasting_share(&found(seed, [0.02, 0.9], 600.0));
             assert!(bias < 0.17, "{bias}");
         }
+    }
+
+    #[test]
+    fn labels_that_were_interpolated_for_long_are_forgotten_when_they_no_longer_are() {
+        let mut scale = RunningScale::default();
+        (0..18_000).for_each(|_| scale.see(0.0));
+        assert!((scale.factor() - LEAST_WHITE).abs() < 1e-12, "{scale:?}");
+        // A minute of draws of the reported size, quantiles of chi-square: at first each raises the
+        // scale, by 1/(2 x 0.347 x 200), and 4.6 are to be made up for.
+        let quantile = |k: i32| -2.0 * ((f64::from(k * 37 % 100) + 0.5) / 100.0).ln();
+        (0..1800).for_each(|k| scale.see(quantile(k)));
+        assert_eq!(scale.factor(), 1.0, "{scale:?}");
     }
 }

@@ -4,9 +4,9 @@
 //! Each camera's pose error shifts its bearings of a target, whose place is not known beforehand.
 //! The residuals of the lines, with the best place taken out, tell how large the cameras' errors
 //! are, and whose: the variances are found by minorisation and maximisation of their likelihood
-//! (REML of variance components), one step per draw, each camera's about the site's typical one. Where nobody has declared a pose's deviation,
-//! the estimate starts from that of a careful survey. A clock that is off by more than its camera
-//! says looks like a pose that is.
+//! (REML of variance components), one step per draw, with a weak prior that cameras of one site are
+//! about equally good. Where nobody has declared a pose's deviation, the estimate starts from that
+//! of a careful survey. A clock that is off by more than its camera says looks like a pose that is.
 
 use crossfix_message::CameraName;
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Vector2, Vector3};
@@ -124,8 +124,9 @@ impl PoseScale {
         let found = found.min(expected * MOST_OF_A_DRAW);
         self.found += (found - self.found) * share;
         self.expected += (expected - self.expected) * share;
-        // Minorisation-maximisation step of a variance with an inverse gamma prior of n degrees of
-        // freedom about the typical factor t: factor * sqrt((found + n t / factor) / (expected + n)).
+        // Minorisation-maximisation step of a variance (the mode of its logarithm) with an inverse
+        // gamma prior of n degrees of freedom about the typical factor t:
+        // factor * sqrt((found + n t / factor) / (expected + n)).
         let found = self.found + TYPICAL_WEIGHT * typical / self.value;
         let step = (found / (self.expected + TYPICAL_WEIGHT)).sqrt();
         // Two cameras can clear each other, but not accuse.

@@ -178,10 +178,12 @@ impl JumpTest<'_> {
         let (Some(before), Some(after)) = (offset(&self.belief), offset(jumped)) else {
             return false;
         };
-        // Wald's test, d^2 / var(d) > 18: for one normal parameter it is the ratio of likelihoods
-        // that a jump must reach anyway.
+        // Wald's test, d^2 / var > 18: for one normal parameter it is the ratio of likelihoods that
+        // a jump must reach anyway. Of a clock that was known no better before, a window that
+        // determines it says enough.
         let change_s = after.offset_s - before.offset_s;
-        jumped.is_possible() && change_s.powi(2) > JUMP * after.relative_sd_s.powi(2)
+        let differs = change_s.powi(2) > JUMP * after.relative_sd_s.powi(2);
+        jumped.is_possible() && (differs || after.relative_sd_s < before.relative_sd_s)
     }
 
     /// The cameras of the window whose clocks may have jumped, the least fitting first.

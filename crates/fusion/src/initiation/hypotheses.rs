@@ -105,9 +105,10 @@ impl Hypothesis {
     /// Least log-likelihood ratio of one target against an object per camera with which it is
     /// confirmed: the logarithm of the number of sets of lines that it may have been chosen from by
     /// chance, the product of the numbers of its cameras' lines. What stands in a view is counted
-    /// where the hypothesis has such a line; one of two cameras has none, as two that stand make no
-    /// hypothesis. If none of its lines has been seen to come or to move, all may stand, and it needs
-    /// as much more as against any other rival.
+    /// where the hypothesis has such a line, but not for two cameras, of which one line at least does
+    /// not stand: a target that flies slowly passes for standing before one of them, and would be
+    /// found ten seconds later. If none of its lines has been seen to come or to move, all may stand,
+    /// and it needs as much more as against any other rival.
     fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
         let cameras = self.cameras();
         let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
@@ -116,7 +117,7 @@ impl Hypothesis {
             lines.get(camera).map_or(1, |[all, others]| if may_stand { *all } else { *others })
         };
         let choices: f64 = cameras.iter().map(|camera| (number(camera).max(1) as f64).ln()).sum();
-        let moves = cameras.len() == 2 || cameras.iter().any(|camera| rooted(camera) == Rooted::No);
+        let moves = cameras.iter().any(|camera| rooted(camera) == Rooted::No);
         if moves { choices } else { choices + RIVAL_MARGIN }
     }
 

@@ -348,8 +348,8 @@ impl Track {
         }
     }
 
-    /// The squared third difference of the camera's last four bearings from the predicted
-    /// directions, in units of the reported noise; `None` if they are too far apart.
+    /// What a bearing and the camera's bearings before it show of its noise, in units of the
+    /// reported one; `None` if the camera has no ties yet.
     pub(super) fn third_differences(
         &mut self,
         camera: &CameraName,
