@@ -21,8 +21,7 @@ const DRAW_SHARE: f64 = 0.1;
 /// draw has two, less what the target's place takes of them, and a pose errs once, however many
 /// draws show it. Cameras of one site have been surveyed alike. Without it two of four cameras would
 /// be taken to be perfect, and the others to be worse than they are: the lines tell of fewer errors
-/// than there are. With 0.5 a camera that is off by 0.2 degrees draws the others with it; with half
-/// of it tracks of poses that are all equally wrong are 15 % more unsure than they say.
+/// than there are. With 0.5 a camera that is off by 0.2 degrees draws the others with it.
 const TYPICAL_WEIGHT: f64 = 0.2;
 /// Largest change of a factor (variance) in one step, so that a camera that is knocked is
 /// recognised in two seconds. With half of it that takes five, with twice as much one wrong start
