@@ -141,6 +141,16 @@ impl LensFile {
     }
 }
 
+impl Split {
+    /// Time from the first to the last instant that poses and clocks were fitted to, s.
+    fn fitted_over_s(&self) -> f64 {
+        let ranges = || self.calibration_rtk_index_ranges.iter().flatten().copied();
+        let first = ranges().fold(f64::INFINITY, f64::min);
+        let last = ranges().fold(f64::NEG_INFINITY, f64::max);
+        (last - first).max(0.0) / RTK_RATE
+    }
+}
+
 impl SplitPart {
     fn holds(self, split: &Split, rtk_seconds: f64) -> bool {
         let index = rtk_seconds * RTK_RATE;
@@ -204,7 +214,8 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<ImportedFli
         };
         let lens: LensFile = parse_json(&lens_path(dir, wanted, selection.dataset))?;
         let labels = read_labels(&folder.join("detections").join(format!("{key}.txt")))?;
-        let source = CameraSource { site: &site, fitted, lens: &lens, is_raw: selection.is_raw };
+        let (fitted_over_s, is_raw) = (split.fitted_over_s(), selection.is_raw);
+        let source = CameraSource { site: &site, fitted, fitted_over_s, lens: &lens, is_raw };
         entries.extend(source.entries(&labels, is_wanted)?);
     }
     Ok(ImportedFlight { entries, log })
@@ -232,6 +243,8 @@ fn read_labels(path: &Path) -> anyhow::Result<Vec<ImportedLabel>> {
 struct CameraSource<'a> {
     site: &'a SiteName,
     fitted: &'a FittedCamera,
+    /// Time over which the clock was fitted, s.
+    fitted_over_s: f64,
     lens: &'a LensFile,
     is_raw: bool,
 }
@@ -291,8 +304,8 @@ impl CameraSource<'_> {
     }
 
     /// Standard deviation of the camera's times, s: the time in which the drone moves by as much as
-    /// the fit's residual. What is left there may be the clock's error as well as the pose's: frames
-    /// are counted, and phones lose some. 6 to 43 ms for these cameras.
+    /// the fit's residual, as what is left there may be the clock's error as well as the pose's; and
+    /// what a clock that wanders differs by from a line that is fitted to it.
     fn clock_sd_s(&self, labels: &[ImportedLabel], model: &CameraModel) -> f64 {
         let direction = |label: &ImportedLabel| model.direction(label.pixel?).ok();
         let mut squared_rates = Vec::new();
@@ -310,7 +323,10 @@ impl CameraSource<'_> {
         }
         let rate = (squared_rates.iter().sum::<f64>() / squared_rates.len() as f64).sqrt();
         // Without a rate nothing is known of the clock.
-        let clock_sd_s = self.fitted.residual_sigma_rad / rate;
+        // A Brownian motion of density w differs from its regression over a time T by the variance
+        // 2 w T / 15 at the ends.
+        let off_line_s = self.clock_wander_s() * (2.0 / 15.0 * self.fitted_over_s).sqrt();
+        let clock_sd_s = (self.fitted.residual_sigma_rad / rate).hypot(off_line_s);
         if clock_sd_s.is_nan() { MOST_CLOCK_SD_S } else { clock_sd_s.min(MOST_CLOCK_SD_S) }
     }
 
@@ -332,8 +348,17 @@ impl CameraSource<'_> {
             return Ok(CameraCalibration::of_lens(name, intrinsics, start)?);
         }
         let camera = self.fitted.camera(intrinsics).with_context(|| format!("camera `{name}`"))?;
-        Ok(CameraCalibration::new(name, &camera, start)
-            .with_pose_sd(self.fitted.residual_sigma_rad, FITTED_POSITION_SD_M))
+        let calibration = CameraCalibration::new(name, &camera, start)
+            .with_pose_sd(self.fitted.residual_sigma_rad, FITTED_POSITION_SD_M);
+        Ok(CameraCalibration { clock_wander_s: self.clock_wander_s(), ..calibration })
+    }
+
+    /// Random wander of the camera's clock, s after one second. Its frames are counted, and each one
+    /// that is lost sets the clock back by a frame's period p. The rate r that was fitted is the mean
+    /// of such losses, r / p a second; they come at random (Poisson), each with the square p^2, so
+    /// the variance grows by r p a second. 0.3 to 9 ms for these cameras.
+    fn clock_wander_s(&self) -> f64 {
+        (self.fitted.clock_rate.abs() / self.lens.fps).sqrt()
     }
 }
 
@@ -451,10 +476,19 @@ mod tests {
         .unwrap()
     }
 
+    /// The labels' reader of a camera that was fitted to a minute and a half.
+    fn source<'a>(
+        site: &'a SiteName,
+        fitted: &'a FittedCamera,
+        lens: &'a LensFile,
+    ) -> CameraSource<'a> {
+        CameraSource { site, fitted, fitted_over_s: 90.0, lens, is_raw: false }
+    }
+
     #[test]
     fn a_clock_is_as_unsure_as_the_residual_leaves_it() {
         let (lens, fitted, site) = (lens(0.0), fitted(), "test".parse().unwrap());
-        let source = CameraSource { site: &site, fitted: &fitted, lens: &lens, is_raw: false };
+        let source = source(&site, &fitted, &lens);
         // 12 of 500 px in six frames are 120 mrad/s; over the gap before frame 60 there is no rate.
         let label = |frame, x| ImportedLabel { frame, pixel: Some(Pixel::new(x, 540.0)) };
         let labels = [label(0, 954.0), label(6, 966.0), label(60, 1200.0)];
@@ -469,13 +503,33 @@ mod tests {
     }
 
     #[test]
+    fn a_clock_wanders_by_the_frames_that_are_lost() {
+        // One frame of 1/30 s lost every ten seconds, for twenty seconds: two on average, give or
+        // take the root of two.
+        let fitted = FittedCamera { clock_rate: -1.0 / 300.0, ..fitted() };
+        let (lens, site) = (lens(0.0), "test".parse().unwrap());
+        let source = source(&site, &fitted, &lens);
+        let entries = source.entries(&[], |_| true).unwrap();
+        let calibration = decode::<CameraCalibration>(&entries[0].data).unwrap();
+        let after_20_s = calibration.clock_wander_s * 20.0_f64.sqrt();
+        assert!((after_20_s - 2.0_f64.sqrt() / 30.0).abs() < 1e-12, "{after_20_s}");
+        // In the 90 s of the fit nine frames, of which the line has left 2/15 at its ends.
+        let labels = [(0, 954.0), (6, 966.0)]
+            .map(|(frame, x)| ImportedLabel { frame, pixel: Some(Pixel::new(x, 540.0)) });
+        let entries = source.entries(&labels, |_| true).unwrap();
+        let sd_s = decode::<BearingFrame>(&entries[1].data).unwrap().capture_time_sd_s;
+        let expected = f64::hypot(0.001 / 0.12, (9.0_f64 * 2.0 / 15.0).sqrt() / 30.0);
+        assert!((sd_s - expected).abs() < 1e-5, "{sd_s}");
+    }
+
+    #[test]
     fn a_label_where_the_lens_has_no_direction_is_left_out_and_the_others_are_not() {
         // A barrel so strong that the polynomial turns back within the image.
         let (lens, fitted) = (lens(-0.3), fitted());
         let label = |frame, x, y| ImportedLabel { frame, pixel: Some(Pixel::new(x, y)) };
         let labels = [label(0, 960.0, 540.0), label(1, 3.0, 3.0), label(2, 1000.0, 500.0)];
         let site = "test".parse().unwrap();
-        let source = CameraSource { site: &site, fitted: &fitted, lens: &lens, is_raw: false };
+        let source = source(&site, &fitted, &lens);
         let entries = source.entries(&labels, |_| true).unwrap();
         let seen: Vec<usize> = entries[1..]
             .iter()
