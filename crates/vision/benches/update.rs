@@ -1,4 +1,4 @@
-//! A whole update of a tracker with one target: gate, correlation, fit, filters, reference; and the
+//! A whole update of a tracker with one target and with thirty: gate, correlation, fit, filters, reference; and the
 //! per-pixel filters of an adaptive reference.
 //!
 //! `cargo bench -p crossfix-vision`
@@ -15,56 +15,107 @@ fn main() {
     divan::main();
 }
 
-/// Frames of a closed path: the target is where it was a round ago.
+/// Frames of a closed path: the targets are where they were a round ago.
 const ROUND: usize = 60;
 
-fn pictures(width: f32, height: f32) -> Vec<Plane> {
-    let mut state = 1_u32;
-    (0..ROUND)
-        .map(|frame| {
-            let angle = frame as f32 / ROUND as f32 * std::f32::consts::TAU;
-            let (x, y) = (160.0 + 20.0 * angle.cos(), 120.0 + 20.0 * angle.sin());
-            Plane::from_fn(320, 240, |column, row| {
-                state ^= state << 13;
-                state ^= state >> 17;
-                state ^= state << 5;
-                let noise = (state >> 24) as f32 / 16.0;
-                let (u, v) =
-                    ((column as f32 - x) / (0.3 * width), (row as f32 - y) / (0.3 * height));
-                let body = (-0.5 * (u * u + v * v)).exp()
-                    + 0.5 * (-0.5 * (u * u + 9.0 * (v + 0.6).powi(2))).exp();
-                90.0 + noise + 80.0 * body
-            })
-        })
-        .collect()
+/// A picture of squares in columns and rows; in each of the first squares a target goes round.
+struct Scene {
+    squares: [usize; 2],
+    targets: usize,
+    /// Sides of a target, px.
+    sides: [f32; 2],
 }
 
-fn update(bencher: Bencher, (width, height): (usize, usize), reference: ReferenceStrategy) {
-    let pictures = pictures(width as f32, height as f32);
+/// Side of a square, px: no target is in another's gate.
+const SQUARE: usize = 160;
+/// Radius of a target's path, px.
+const RADIUS: f32 = 20.0;
+
+impl Scene {
+    /// Where the targets are in a frame.
+    fn places(&self, frame: usize) -> Vec<[f32; 2]> {
+        let turn = frame as f32 / ROUND as f32 * std::f32::consts::TAU;
+        let columns = self.squares[0];
+        let place = |k: usize| {
+            // Each at another point of its path: if all went the same way, the camera would have
+            // turned.
+            let angle = turn + k as f32;
+            let at = |square: usize| (square as f32 + 0.5) * SQUARE as f32;
+            [at(k % columns) + RADIUS * angle.cos(), at(k / columns) + RADIUS * angle.sin()]
+        };
+        (0..self.targets).map(place).collect()
+    }
+
+    fn pictures(&self) -> Vec<Plane> {
+        let mut state = 1_u32;
+        let [width, height] = self.sides;
+        let [columns, rows] = self.squares.map(|count| count * SQUARE);
+        (0..ROUND)
+            .map(|frame| {
+                let places = self.places(frame);
+                Plane::from_fn(columns, rows, |column, row| {
+                    state ^= state << 13;
+                    state ^= state >> 17;
+                    state ^= state << 5;
+                    let noise = (state >> 24) as f32 / 16.0;
+                    let square = row / SQUARE * self.squares[0] + column / SQUARE;
+                    let Some([x, y]) = places.get(square) else { return 90.0 + noise };
+                    let (u, v) =
+                        ((column as f32 - x) / (0.3 * width), (row as f32 - y) / (0.3 * height));
+                    let body = (-0.5 * (u * u + v * v)).exp()
+                        + 0.5 * (-0.5 * (u * u + 9.0 * (v + 0.6).powi(2))).exp();
+                    90.0 + noise + 80.0 * body
+                })
+            })
+            .collect()
+    }
+}
+
+fn update(bencher: Bencher, scene: &Scene, reference: ReferenceStrategy) {
+    let pictures = scene.pictures();
     let config = TrackerConfig { reference, ..TrackerConfig::default() };
     let Ok(mut tracker) = ImageTracker::new(config) else { return };
-    let (w, h) = (width as f64, height as f64);
-    tracker.take_up(PixelBox { x: 180.5 - w / 2.0, y: 120.5 - h / 2.0, width: w, height: h });
+    let [width, height] = scene.sides.map(f64::from);
+    for [x, y] in scene.places(0) {
+        let (x, y) = (f64::from(x) + 0.5 - width / 2.0, f64::from(y) + 0.5 - height / 2.0);
+        tracker.take_up(PixelBox { x, y, width, height });
+    }
     let mut frame = 0;
-    let mut step = || {
-        let time = Timestamp::from_seconds(frame as f64 / 30.0);
+    // Each picture is written anew before it is looked at, as by a camera's driver or a decoder.
+    let mut next = || {
         frame += 1;
-        tracker.step(black_box(&pictures[(frame - 1) % ROUND]), time).len()
+        (pictures[(frame - 1) % ROUND].clone(), Timestamp::from_seconds(frame as f64 / 30.0))
     };
     for _ in 0..2 * ROUND {
-        step();
+        let (picture, time) = next();
+        tracker.step(&picture, time);
     }
-    bencher.bench_local(step);
+    bencher
+        .counter(ItemsCount::new(scene.places(0).len()))
+        .with_inputs(next)
+        .bench_local_values(|(picture, time)| tracker.step(black_box(&picture), time).len());
 }
 
+/// One target in an image of 320x320: a third of the images are registered with the scene, and one
+/// in eighteen becomes one of its pictures.
 #[divan::bench(args = [(10, 6), (25, 15), (50, 30)])]
-fn tracker_update(bencher: Bencher, sides: (usize, usize)) {
-    update(bencher, sides, ReferenceStrategy::default());
+fn tracker_update(bencher: Bencher, (width, height): (u8, u8)) {
+    let scene = Scene { squares: [2, 2], targets: 1, sides: [width.into(), height.into()] };
+    update(bencher, &scene, ReferenceStrategy::default());
+}
+
+/// Thirty targets in an image of 960x800: the items a second are the updates of one of them, with
+/// its share of the registration.
+#[divan::bench(args = [(10, 6), (25, 15), (50, 30)])]
+fn tracker_update_of_thirty(bencher: Bencher, (width, height): (u8, u8)) {
+    let scene = Scene { squares: [6, 5], targets: 30, sides: [width.into(), height.into()] };
+    update(bencher, &scene, ReferenceStrategy::default());
 }
 
 #[divan::bench(args = [(10, 6), (25, 15)])]
-fn tracker_update_imm_reference(bencher: Bencher, sides: (usize, usize)) {
-    update(bencher, sides, ReferenceStrategy::PixelImm(ImmConfig::default()));
+fn tracker_update_imm_reference(bencher: Bencher, (width, height): (u8, u8)) {
+    let scene = Scene { squares: [2, 2], targets: 1, sides: [width.into(), height.into()] };
+    update(bencher, &scene, ReferenceStrategy::PixelImm(ImmConfig::default()));
 }
 
 #[divan::bench]
