@@ -27,6 +27,7 @@
 
 mod appearance;
 mod arrival;
+mod coarse;
 mod config;
 mod crop;
 mod detector;
@@ -44,6 +45,7 @@ mod likelihood;
 mod motion;
 mod noise;
 mod paper;
+mod place_map;
 mod posterior;
 mod reference;
 mod registration;

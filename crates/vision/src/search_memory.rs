@@ -9,6 +9,7 @@ use crossfix_correlation::Plane;
 
 use crate::TrackerConfig;
 use crate::appearance::{Appearance, AppearanceScratch};
+use crate::place_map::PlaceMap;
 use crate::state::TargetBelief;
 
 /// Correlation below which two appearances are different: on the real and drawn cases those of
@@ -32,12 +33,25 @@ pub(crate) struct Background {
     pub(crate) ratios: Plane,
 }
 
+/// Where a target may be, as of the last image that was searched for it.
+#[derive(Clone, Debug)]
+pub(crate) struct SearchMap {
+    pub(crate) places: PlaceMap,
+    /// For how long the target had not been seen then, s, and how far the scene had moved, px.
+    pub(crate) unseen_s: f64,
+    pub(crate) turned: [f64; 2],
+    /// How fast the target was when it was lost, px/s.
+    pub(crate) speed: f64,
+}
+
 /// What is kept for a search.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SearchMemory {
     /// How often the target has been searched for since it was last seen.
     pub(crate) searches: u32,
     pub(crate) background: Option<Background>,
+    /// Where the target may be since it was seen last.
+    pub(crate) map: Option<SearchMap>,
     other: Option<Box<OtherAppearance>>,
 }
 
@@ -56,7 +70,7 @@ struct OtherAppearance {
 impl SearchMemory {
     /// Forgets what belongs to one loss: the target has been seen.
     pub(crate) fn seen(&mut self) {
-        (self.searches, self.background) = (0, None);
+        (self.searches, self.background, self.map) = (0, None, None);
     }
 
     /// Forgets the appearance that is not in use: the target has been seen for sure.

@@ -19,23 +19,16 @@ impl Target {
             self.state.missed += 1;
             return TargetStep::unseen(0.0);
         }
-        self.find_again(frame, scratch).unwrap_or_else(|score| {
+        self.find_again(frame, scratch).unwrap_or_else(|| {
             self.state.missed += 1;
-            TargetStep::unseen(score)
+            TargetStep::unseen(0.0)
         })
     }
 
-    /// Takes what a search finds, if it is accepted; else returns its score.
-    fn find_again(
-        &mut self,
-        frame: FrameInput<'_>,
-        scratch: &mut Scratch,
-    ) -> Result<TargetStep, f64> {
+    /// Takes what a search finds.
+    fn find_again(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetStep> {
         let Self { state, identity, search_memory: memory, .. } = self;
-        let found = Sought { state, identity, memory }.find(frame, scratch);
-        let Some(fit) = found.fit.filter(|_| found.accepted) else {
-            return Err(found.fit.map_or(0.0, |fit| fit.score));
-        };
+        let fit = Sought { state, identity, memory }.find(frame, scratch)?;
         self.identity.begin_probation(&self.state, frame.scene);
         let (found, expected) = (fit.found(), self.state.motion.found());
         let is_near = |i: usize| {
@@ -52,7 +45,7 @@ impl Target {
         self.seen(fit.place);
         self.hypotheses.clear();
         let measured = self.state.measurement(&fit);
-        Ok(TargetStep { measured: Some(measured), score: fit.score, certainty: 1.0, nis: None })
+        Some(TargetStep { measured: Some(measured), score: fit.score, certainty: 1.0, nis: None })
     }
 
     /// Follows what a search has found. If that is lost again soon it was something else, and the
