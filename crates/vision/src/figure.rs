@@ -209,18 +209,24 @@ fn depths(landscape: &Plane) -> Plane {
     Plane::from_fn(width, height, |x, y| surface.row(y)[x] - landscape.row(y)[x])
 }
 
-/// The box of the target that somebody meant by a given box: the given one where it fits, and else
-/// that of the one thing that stands out there, if there is one.
+/// The box of the target that somebody meant by a given box: the given one where it fits the one
+/// thing that stands out there, and else that of the thing; `None` if nothing stands out, or more
+/// than one thing does.
 ///
 /// `given_sd` is how well a given box lies on its target, px, and `noise_sd` the standard deviation
 /// of the image's noise.
-pub(crate) fn meant(image: &Plane, given: PixelBox, given_sd: f64, noise_sd: f32) -> PixelBox {
+pub(crate) fn meant(
+    image: &Plane,
+    given: PixelBox,
+    given_sd: f64,
+    noise_sd: f32,
+) -> Option<PixelBox> {
     let windows = (0..WINDOWS).rev().map(|window| f64::from(window) / f64::from(WINDOWS - 1));
     let mut figures = windows.filter_map(|share| {
         figure_within(image, given, given_sd, share * (FURTHEST * given_sd + GROUND_PX), noise_sd)
     });
     // From the widest window down: the first that shows a single thing decides.
-    figures.next().filter(|figure| !fits(given, *figure)).unwrap_or(given)
+    figures.next().map(|figure| if fits(given, figure) { given } else { figure })
 }
 
 /// Whether a box fits its figure well enough to be kept.

@@ -21,6 +21,10 @@ const MOST_CANDIDATES: usize = 6;
 /// found is on probation. With half of it half a percent more of a still camera's frames are right,
 /// and as many fewer of a panning one's.
 const CANDIDATE_S: f64 = 0.5;
+/// For this long after it was given a target may be taken up anew where it shows, s: a video's
+/// compression hides a bird of five pixels for some images. With half of it a box with nothing in it
+/// is followed more often, with twice as much what flies into it is taken for the target.
+const SHOWN_WITHIN_S: f64 = 0.5;
 /// Largest ratio of a candidate's mean side to the target's, either way: of a drone before trees
 /// only the brightest part is found.
 const STAND_IN_SIZES: f64 = 4.0;
@@ -34,9 +38,13 @@ impl ImageTracker {
     pub(crate) fn take_up_new(&mut self, image: &Plane, time: Timestamp, interval: f64) {
         let given = std::mem::take(&mut self.waiting);
         let found = self.detect(image, interval, &given);
-        for place in given {
-            let place = self.meant(image, place);
-            self.take_up_at(image, place, Origin::Given, time);
+        self.take_up_late(image, time);
+        for given in given {
+            let meant = self.meant(image, given);
+            self.take_up_at(image, meant.unwrap_or(given), Origin::Given, time);
+            if let Some(followed) = self.followed.last_mut() {
+                followed.unshown = meant.is_none().then_some(given);
+            }
         }
         // A stand-in may look like its target by now.
         for index in 0..self.followed.len() {
@@ -93,6 +101,7 @@ impl ImageTracker {
             searched: None,
             cue: None,
             stand_in: None,
+            unshown: None,
         });
     }
 
@@ -142,11 +151,33 @@ impl ImageTracker {
             && self.followed.iter().all(|other| other.stand_in != Some(followed.id))
     }
 
-    /// The box of the target that somebody meant by a given box.
-    fn meant(&mut self, image: &Plane, place: PixelBox) -> PixelBox {
+    /// Takes up anew what was given by a box in which nothing stood out, if it is not seen and
+    /// something stands out there now.
+    fn take_up_late(&mut self, image: &Plane, time: Timestamp) {
+        for index in 0..self.followed.len() {
+            let followed = &mut self.followed[index];
+            followed.unshown.take_if(|_| time.seconds_since(followed.since) > SHOWN_WITHIN_S);
+            let Some(given) = followed.unshown.filter(|_| !followed.target.is_seen()) else {
+                continue;
+            };
+            let Some(meant) = self.meant(image, given) else { continue };
+            let target = Follower::new(image, meant, &mut self.scratch, &self.config);
+            let followed = &mut self.followed[index];
+            (followed.target, followed.unshown, followed.measured_at) = (target, None, time);
+            let step = TargetStep { measured: None, score: 1.0, certainty: 1.0, nis: None };
+            let track = describe(followed.id, &followed.target, TrackPhase::Tentative, step);
+            if let Some(shown) = self.tracks.iter_mut().find(|shown| shown.id == followed.id) {
+                *shown = track;
+            }
+        }
+    }
+
+    /// The box of the target that somebody meant by a given box; `None` if the image does not show
+    /// it.
+    fn meant(&mut self, image: &Plane, place: PixelBox) -> Option<PixelBox> {
         let TrackerConfig { algorithm, box_sd_px, noise_floor, .. } = self.config;
         if algorithm == Algorithm::Paper || box_sd_px <= 0.0 {
-            return place;
+            return Some(place);
         }
         // The noise is that of the surroundings: the ground below a sky has other noise.
         let PixelBox { x, y, width, height } = place;

@@ -175,6 +175,8 @@ pub(crate) struct Followed {
     pub(crate) since: Timestamp,
     /// The candidate that is shown in its place while it is lost.
     pub(crate) stand_in: Option<ImageTrackId>,
+    /// The box by which somebody has given it, if nothing stood out there.
+    pub(crate) unshown: Option<PixelBox>,
 }
 
 impl Followed {

@@ -134,3 +134,23 @@ fn nothing_but_noise_moves_no_box() {
         assert_eq!((track.position, track.width), (place.centre(), place.width), "seed {seed}");
     }
 }
+
+#[test]
+fn what_does_not_show_in_the_image_of_its_box_is_taken_up_when_it_does() {
+    for seed in 0..20 {
+        let spot = |frame: u64| Spot { x: 60.0 + 1.5 * frame as f32, y: 60.0, contrast: -50.0 };
+        let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
+        tracker.take_up(drawn(spot(0), [3.0, -2.0], 3.0));
+        for frame in 0..40 {
+            // A video's compression has taken it away for a sixth of a second.
+            let shown = if frame < 5 { vec![] } else { vec![spot(frame)] };
+            let time = Timestamp::from_seconds(frame as f64 / 30.0);
+            let track = tracker.step(&sky(100 * seed + frame, &shown, is_sky), time)[0];
+            assert_eq!(track.id.0, 1);
+            if frame > 12 {
+                assert!(off(&track, spot(frame)) < 2.0, "seed {seed}, image {frame}: {track:?}");
+                assert!(track.width < 22.0, "seed {seed}: {}", track.width);
+            }
+        }
+    }
+}
