@@ -268,8 +268,17 @@ impl CameraCalibration {
         self
     }
 
-    /// Whether it comes from a flight, which corrects the camera's clock too: the times of bearings that are
-    /// published with it are corrected already.
+    /// The same calibration with the wander of the clock, s after one second.
+    #[must_use]
+    pub fn with_clock_wander(mut self, clock_wander_s: f64) -> Self {
+        self.clock_wander_s = clock_wander_s;
+        self.hash = self.content_hash();
+        self
+    }
+
+    /// Whether the times of bearings that are published with it are corrected already: it comes from
+    /// a fit of the camera's clock too (to a flight, or before an import), which alone states a
+    /// clock's wander.
     pub fn corrects_clock(&self) -> bool {
         self.datum.is_some() || self.clock_wander_s > 0.0
     }

@@ -1,5 +1,5 @@
-//! A whole update of a tracker with one target and with thirty: gate, correlation, fit, filters, reference; and the
-//! per-pixel filters of an adaptive reference.
+//! A whole update of a tracker with one target and with thirty (gate, correlation, fit, filters,
+//! reference), and the per-pixel filters of an adaptive reference.
 //!
 //! `cargo bench -p crossfix-vision`
 
@@ -93,7 +93,7 @@ fn update(bencher: Bencher, scene: &Scene, reference: ReferenceStrategy) {
     bencher
         .counter(ItemsCount::new(scene.places(0).len()))
         .with_inputs(next)
-        .bench_local_values(|(picture, time)| tracker.step(black_box(&picture), time).len());
+        .bench_local_refs(|(picture, time)| tracker.step(black_box(picture), *time).len());
 }
 
 /// One target in an image of 320x320: a third of the images are registered with the scene, and one

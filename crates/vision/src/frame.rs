@@ -58,8 +58,6 @@ pub(crate) struct TargetStep {
 }
 
 impl TargetStep {
-    /// Result if the target was not seen; the best place has this correlation.
-    pub(crate) fn unseen(score: f64) -> Self {
-        Self { measured: None, score, certainty: 0.0, nis: None }
-    }
+    /// Result if the target was not seen.
+    pub(crate) const UNSEEN: Self = Self { measured: None, score: 0.0, certainty: 0.0, nis: None };
 }

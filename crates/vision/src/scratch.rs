@@ -5,6 +5,7 @@ use crossfix_correlation::{Correlator, Plane, Statistics};
 use crate::appearance::AppearanceScratch;
 use crate::arrival::ComparisonBuffers;
 use crate::noise::NoiseMeter;
+use crate::place_map::SpreadBuffers;
 use crate::posterior::PosteriorMap;
 
 /// Buffers of one step of one target, whose contents nobody reads after it.
@@ -28,4 +29,5 @@ pub(crate) struct SearchScratch {
     pub(crate) fine: Plane,
     pub(crate) change: Plane,
     pub(crate) contrasts: Vec<f32>,
+    pub(crate) spread: SpreadBuffers,
 }

@@ -17,12 +17,12 @@ use crate::scratch::Scratch;
 use crate::search_memory::{Background, SearchMap, SearchMemory};
 use crate::state::TargetBelief;
 
-/// Probability from which on the map has found the target. With 0.9 one drawn sequence in forty is
+/// Probability in one place from which on the map has found the target. With 0.9 one drawn sequence in forty is
 /// lost for good, as something else is found and followed; with 0.999 an eighth more of the frames
 /// of small targets in noise are lost.
-const FOUND: f32 = 0.99;
-/// A place in what has changed is accepted if its log likelihood ratio is at least `LEAST_RATIO` and
-/// at least `MARGIN` above that of the next best place, and if its contrast is by `ABOVE_CHANCE`
+const SURE_PLACE: f32 = 0.99;
+/// A place in what has changed (and a find of the detector, by the first of these) is accepted if its
+/// log likelihood ratio is at least `LEAST_RATIO` and at least `MARGIN` above that of the next best place, and if its contrast is by `ABOVE_CHANCE`
 /// nats likelier the target's than the best one's of all places searched. On the shared and drawn
 /// cases half of the places that such a search takes for the target are others' without the last
 /// condition, and with 4 a third; with twice as much an eighth of the right ones is refused.
@@ -41,8 +41,8 @@ pub(crate) struct Sought<'a> {
 }
 
 impl Sought<'_> {
-    /// Searches for it: in every image by the map, after a second with its first appearance; and
-    /// in every other one in what has changed, by turns with its last appearance and its first. It
+    /// Searches for it: by the map, after a second with its first appearance; and every other time
+    /// in what has changed, by turns with its last appearance and its first. It
     /// keeps the appearance by which it is found.
     pub(crate) fn find(
         &mut self,
@@ -75,37 +75,45 @@ impl Sought<'_> {
     fn find_by_map(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetFit> {
         let coarse = CoarseReference::of(self.state, frame.image, scratch)?;
         self.remember_background(frame, &coarse, scratch);
-        let sides = correlate_whole(frame.image, &coarse, scratch);
-        // Noise is whatever the picture's places look like the target by: where there are clouds,
-        // that is more than the image's own.
-        let mut expected = coarse.expectation(self.state, self.state.noise, frame.config);
-        let likeness = coarse.likeness(scratch).deviation as f32;
-        expected.noise = expected.noise.max(likeness * likeness * expected.energy);
-        log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
-
+        let sides = whole_ratios(self.state, frame.image, &coarse, frame.config, scratch);
         let area = SearchArea::whole(self.state, sides, coarse.coarseness);
+        let turned = frame.scene.turned();
         for y in 0..sides[1] {
             for (x, ratio) in scratch.ratios.row_mut(y).iter_mut().enumerate() {
                 // The reference found this much of the target in the empty scene already.
-                *ratio -= area.background_at(x, y, self.state, self.memory);
+                *ratio -= area.background_at([x, y], turned, self.state, self.memory);
             }
         }
-        let map = self.map(frame, &area, sides);
+        let near = area.near();
+        let map = self.predicted_map(frame, &area, sides, scratch);
         map.update(&scratch.ratios);
-        let likeliest = map.likeliest(area.near());
-        if likeliest.probability < FOUND {
+        let likeliest = map.likeliest(near);
+        let is_sure = likeliest.probability >= SURE_PLACE;
+        if !is_sure {
             return None;
         }
-        let place = [area.middle(likeliest.column), area.middle(likeliest.row)];
-        self.find_near(frame, (place, 2 * coarse.coarseness + 1), scratch)
+        let cell = [likeliest.column, likeliest.row];
+        let (state, config) = (&mut *self.state, frame.config);
+        let (place, reach) = (cell.map(|at| area.middle(at)), (2 * coarse.coarseness + 1) as f64);
+        let peak = state.best_near(frame.image, state.noise, place, reach, scratch, config);
+        let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
+        if self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0 {
+            return Some(fit);
+        }
+        // It belongs to the scene.
+        if let Some(map) = &mut self.memory.map {
+            map.places.exclude(cell, near);
+        }
+        None
     }
 
     /// The map of the target's places, as expected of this image.
-    fn map(
+    fn predicted_map(
         &mut self,
         frame: FrameInput<'_>,
         area: &SearchArea,
         sides: [usize; 2],
+        scratch: &mut Scratch,
     ) -> &mut PlaceMap {
         let state = &*self.state;
         let turned = frame.scene.turned();
@@ -124,27 +132,11 @@ impl Sought<'_> {
             }
         });
         let elapsed = (state.unseen_s - map.unseen_s).max(0.0);
-        // What is at p now was at p + turned at first: it has moved by as much as that is less now.
+        // The same thing has moved in the image by what the scene had turned before, less now.
         let moved = [0, 1].map(|i| map.turned[i] - turned[i]);
-        map.places.predict(elapsed, map.speed * elapsed, moved);
+        map.places.predict(elapsed, map.speed * elapsed, moved, &mut scratch.search.spread);
         (map.unseen_s, map.turned) = (state.unseen_s, turned);
         &mut self.memory.map.insert(map).places
-    }
-
-    /// The target at full resolution within `reach` px of a place, unless what is there belongs to
-    /// the scene.
-    fn find_near(
-        &mut self,
-        frame: FrameInput<'_>,
-        (place, reach): ([f64; 2], usize),
-        scratch: &mut Scratch,
-    ) -> Option<TargetFit> {
-        let (state, config) = (&mut *self.state, frame.config);
-        let reach = reach as f64;
-        let peak = state.best_near(frame.image, state.noise, place, reach, scratch, config);
-        let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
-        let has_come = self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0;
-        has_come.then_some(fit)
     }
 
     fn find_in_change(
@@ -194,22 +186,33 @@ impl Sought<'_> {
         let is_known = background.as_ref().is_some_and(|known| known.coarseness == coarseness);
         let snapshot = frame.snapshot.filter(|_| !is_known && self.state.in_snapshot.is_some());
         let Some(snapshot) = snapshot else { return };
-        correlate_whole(snapshot, coarse, scratch);
-        let expected = coarse.expectation(self.state, self.state.noise, frame.config);
-        log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
-        *background = Some(Background { coarseness, ratios: scratch.ratios.clone() });
+        whole_ratios(self.state, snapshot, coarse, frame.config, scratch);
+        let (ratios, turned) = (scratch.ratios.clone(), frame.scene.turned());
+        *background = Some(Background { coarseness, ratios, turned });
     }
 }
 
-/// Correlates all of an image, made coarser, into `scratch.statistics`; returns the sides of the
-/// coarse picture.
-fn correlate_whole(image: &Plane, coarse: &CoarseReference, scratch: &mut Scratch) -> [usize; 2] {
+/// Log likelihood ratios of every place of an image, made coarser, into `scratch.ratios`; returns
+/// the sides of the coarse picture.
+fn whole_ratios(
+    state: &TargetBelief,
+    image: &Plane,
+    coarse: &CoarseReference,
+    config: &TrackerConfig,
+    scratch: &mut Scratch,
+) -> [usize; 2] {
     let mut picture = std::mem::take(&mut scratch.search.coarse);
     coarsened(image, coarse.coarseness, &mut picture);
     replace_invalid(&mut picture);
     let sides = [picture.width(), picture.height()];
     coarse.correlate(&picture, &sides.map(|side| 0..side), scratch);
     scratch.search.coarse = picture;
+    // Noise is whatever the picture's places look like the target by: where there are clouds, that
+    // is more than the image's own.
+    let mut expected = coarse.expectation(state, state.noise, config);
+    let likeness = coarse.likeness(scratch).deviation as f32;
+    expected.noise = expected.noise.max(likeness * likeness * expected.energy);
+    log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
     sides
 }
 
@@ -406,21 +409,26 @@ impl SearchArea {
         }
     }
 
-    /// Log likelihood ratio that the scene itself had at a place of the coarse picture; 0 where the
-    /// target hid it, and where nothing is known of it.
+    /// Log likelihood ratio that the scene itself had at a place of the coarse picture, given how it
+    /// has turned by now; 0 where the target hid it, and where nothing is known of it.
     fn background_at(
         &self,
-        column: usize,
-        row: usize,
+        at: [usize; 2],
+        turned: [f64; 2],
         state: &TargetBelief,
         memory: &SearchMemory,
     ) -> f32 {
         let (Some(background), Some(seen)) = (&memory.background, state.in_snapshot) else {
             return 0.0;
         };
-        let near = (self.middle(column) - seen.x).abs() <= self.sides[0] as f64
-            && (self.middle(row) - seen.y).abs() <= self.sides[1] as f64;
-        if near { 0.0 } else { background.ratios.clamped(column as isize, row as isize).max(0.0) }
+        let then = [0, 1].map(|i| self.middle(at[i]) + turned[i] - background.turned[i]);
+        let [dx, dy] = [then[0] - seen.x, then[1] - seen.y].map(f64::abs);
+        if dx <= self.sides[0] as f64 && dy <= self.sides[1] as f64 {
+            return 0.0;
+        }
+        let [column, row] =
+            then.map(|then| ((then + 0.5) / self.coarseness as f64 - 0.5).round() as isize);
+        background.ratios.clamped(column, row).max(0.0)
     }
 
     /// The middle of a column or row of the coarse picture, px of the full picture.

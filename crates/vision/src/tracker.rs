@@ -50,7 +50,8 @@ pub struct ImageTrack {
     pub width: f64,
     /// Sides of the box, px.
     pub height: f64,
-    /// Correlation at the best place, 0 to 1; with the papers' algorithm, the peak of its measure.
+    /// Correlation at the best place, 0 to 1, and 0 while the target is searched for; with the
+    /// papers' algorithm, the peak of its measure.
     pub score: f64,
     /// Probability that the target is at the best place and nowhere else.
     pub certainty: f64,
@@ -295,10 +296,21 @@ impl ImageTracker {
     pub fn look_elsewhere(&mut self) {
         self.followed.clear();
         self.tracks.clear();
+        self.forget_scene();
+        self.last = None;
+    }
+
+    /// Forgets what the scene looks like and where lost targets may be in it.
+    fn forget_scene(&mut self) {
         self.snapshot = None;
         self.scene.clear();
         self.detector = self.config.detector.clone().map(Detector::new);
-        self.last = None;
+        for followed in &mut self.followed {
+            if let Follower::Posterior(target) = &mut followed.target {
+                target.search_memory.forget_places();
+                target.state.in_snapshot = None;
+            }
+        }
     }
 
     /// Number of images that were refused.
@@ -320,8 +332,7 @@ impl ImageTracker {
         let interval = self.last.map_or(LONGEST_INTERVAL, since);
         if self.last.is_some_and(|last| time.seconds_since(last.time) > LONGEST_INTERVAL) {
             // Nobody knows what the camera did meanwhile.
-            self.scene.clear();
-            self.detector = self.config.detector.clone().map(Detector::new);
+            self.forget_scene();
         }
         self.last = Some(shot);
 
@@ -409,10 +420,8 @@ impl ImageTracker {
             (followed.measured_at, followed.since, followed.searched) =
                 (shot.time, shot.time, None);
         }
-        self.snapshot = None;
-        self.scene.clear();
+        self.forget_scene();
         self.last = None;
-        self.detector = self.config.detector.clone().map(Detector::new);
         true
     }
 

@@ -132,19 +132,21 @@ fn what_stands_out_of_no_single_image_is_found_again_by_several() {
     let found = (0..10).filter(|&seed| {
         let mut scene = Scene::new(seed, 4.0, 45.0, 36.0);
         let mut tracker = tracker_on([60.0, 60.0]);
-        let mut found = false;
+        let mut seen = 0;
         for frame in 0..160 {
             // It is followed for two seconds and a half, hidden for two, and comes out elsewhere. Of
-            // the 40 000 places of an image some look more like it than it does itself.
+            // the ten thousand places of an image some look more like it than it does itself.
             let at = match frame {
                 0..60 => [60.0 + 0.5 * frame as f32, 60.0],
                 _ => [150.0 + 0.8 * (frame as f32 - 105.0), 120.0],
             };
             let is_there = !(60..105).contains(&frame);
             let track = step(&mut tracker, &scene.image(is_there.then_some(at), [0.0; 2]), frame);
-            found |= frame > 105 && track.phase == TrackPhase::Tracking && off(&track, at) < 3.0;
+            // What stands in for a lost target has a certainty of a half at most.
+            let is_on_it = track.certainty > 0.5 && off(&track, at) < 3.0;
+            seen += usize::from(frame >= 150 && is_on_it);
         }
-        found
+        seen >= 8
     });
     let found = found.count();
     // By single images two are.

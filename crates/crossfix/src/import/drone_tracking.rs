@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use crossfix_geometry::{
     Bearing, Camera, CameraModel, Distortion, GeometryError, ImageSize, Intrinsics, Pixel, Pose,
 };
@@ -65,6 +65,10 @@ const RAW_LABEL_SD_PX: f64 = 1.0;
 /// Time over which the drone's angular rate is taken, s: with a frame's it would be the labels'
 /// noise, with a second's the drone's turns would be lost.
 const RATE_OVER_S: f64 = 0.2;
+/// Frame rates that a camera may have, frames per second, and the largest rate of its clock against
+/// true time, s/s: beyond these a file is broken.
+const FRAME_RATES: std::ops::RangeInclusive<f64> = 1.0..=1000.0;
+const MOST_CLOCK_RATE: f64 = 0.1;
 /// Largest standard deviation of a clock, s: one of which nothing is known.
 const MOST_CLOCK_SD_S: f64 = 1.0;
 
@@ -212,7 +216,17 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<ImportedFli
                 known.join(", ")
             );
         };
-        let lens: LensFile = parse_json(&lens_path(dir, wanted, selection.dataset))?;
+        let lens_path = lens_path(dir, wanted, selection.dataset);
+        let lens: LensFile = parse_json(&lens_path)?;
+        let is_possible =
+            FRAME_RATES.contains(&lens.fps) && fitted.clock_rate.abs() < MOST_CLOCK_RATE;
+        ensure!(
+            is_possible,
+            "camera `{wanted}`: {} frames a second ({}), or a clock that gains {} s a second, are none",
+            lens.fps,
+            lens_path.display(),
+            fitted.clock_rate
+        );
         let labels = read_labels(&folder.join("detections").join(format!("{key}.txt")))?;
         let (fitted_over_s, is_raw) = (split.fitted_over_s(), selection.is_raw);
         let source = CameraSource { site: &site, fitted, fitted_over_s, lens: &lens, is_raw };
@@ -322,11 +336,12 @@ impl CameraSource<'_> {
             }
         }
         let rate = (squared_rates.iter().sum::<f64>() / squared_rates.len() as f64).sqrt();
-        // Without a rate nothing is known of the clock.
         // A Brownian motion of density w differs from its regression over a time T by the variance
-        // 2 w T / 15 at the ends.
+        // 2 w T / 15 at the ends. Beyond them the line's slope is taken for right, and the wander
+        // goes on from there.
         let off_line_s = self.clock_wander_s() * (2.0 / 15.0 * self.fitted_over_s).sqrt();
         let clock_sd_s = (self.fitted.residual_sigma_rad / rate).hypot(off_line_s);
+        // Without a rate nothing is known of the clock.
         if clock_sd_s.is_nan() { MOST_CLOCK_SD_S } else { clock_sd_s.min(MOST_CLOCK_SD_S) }
     }
 
@@ -348,15 +363,16 @@ impl CameraSource<'_> {
             return Ok(CameraCalibration::of_lens(name, intrinsics, start)?);
         }
         let camera = self.fitted.camera(intrinsics).with_context(|| format!("camera `{name}`"))?;
-        let calibration = CameraCalibration::new(name, &camera, start)
-            .with_pose_sd(self.fitted.residual_sigma_rad, FITTED_POSITION_SD_M);
-        Ok(CameraCalibration { clock_wander_s: self.clock_wander_s(), ..calibration })
+        Ok(CameraCalibration::new(name, &camera, start)
+            .with_pose_sd(self.fitted.residual_sigma_rad, FITTED_POSITION_SD_M)
+            .with_clock_wander(self.clock_wander_s()))
     }
 
-    /// Random wander of the camera's clock, s after one second. Its frames are counted, and each one
-    /// that is lost sets the clock back by a frame's period p. The rate r that was fitted is the mean
-    /// of such losses, r / p a second; they come at random (Poisson), each with the square p^2, so
-    /// the variance grows by r p a second. 0.3 to 9 ms for these cameras.
+    /// Random wander of the camera's clock, s after one second: as if the whole rate r that was fitted
+    /// came from frames that were lost, or taken twice. Each moves the clock by a frame's period p;
+    /// there are r / p a second, at random (Poisson), so the variance grows by r p a second. How
+    /// many of them the lens file's rate of frames contains is not known, but four times as many, or
+    /// a quarter, give the same tracks to a tenth. 0.4 to 8 ms for these cameras.
     fn clock_wander_s(&self) -> f64 {
         (self.fitted.clock_rate.abs() / self.lens.fps).sqrt()
     }
@@ -503,14 +519,15 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_wanders_by_the_frames_that_are_lost() {
-        // One frame of 1/30 s lost every ten seconds, for twenty seconds: two on average, give or
-        // take the root of two.
+    fn a_clock_wanders_by_the_frames_that_are_lost_or_taken_twice() {
+        // One frame of 1/30 s taken twice every ten seconds, for twenty seconds: two on average, give
+        // or take the root of two.
         let fitted = FittedCamera { clock_rate: -1.0 / 300.0, ..fitted() };
         let (lens, site) = (lens(0.0), "test".parse().unwrap());
         let source = source(&site, &fitted, &lens);
         let entries = source.entries(&[], |_| true).unwrap();
         let calibration = decode::<CameraCalibration>(&entries[0].data).unwrap();
+        assert_eq!(calibration.hash, calibration.content_hash());
         let after_20_s = calibration.clock_wander_s * 20.0_f64.sqrt();
         assert!((after_20_s - 2.0_f64.sqrt() / 30.0).abs() < 1e-12, "{after_20_s}");
         // In the 90 s of the fit nine frames, of which the line has left 2/15 at its ends.

@@ -55,7 +55,7 @@ impl Target {
         let Some(best) = self.hypotheses.best().cloned() else {
             self.hypotheses.clear();
             self.state.missed += 1;
-            return TargetStep::unseen(0.0);
+            return TargetStep::UNSEEN;
         };
         // The likeliest hypothesis is reported; its covariance gets the spread of the others
         // (`covariances`).
@@ -66,7 +66,7 @@ impl Target {
         let Some([column, row]) = best.peak else {
             self.state.missed += u32::from(is_unseen);
             self.settle(0.0);
-            return TargetStep::unseen(0.0);
+            return TargetStep::UNSEEN;
         };
         let sure = self.hypotheses.share_near([column, row], self.state.peak_half());
         let fit = self.state.fit_at(column, row, region.origin, scratch, frame.config);

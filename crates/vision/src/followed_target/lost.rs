@@ -17,11 +17,11 @@ impl Target {
         self.state.forget_contrast(frame.interval);
         if !frame.may_search {
             self.state.missed += 1;
-            return TargetStep::unseen(0.0);
+            return TargetStep::UNSEEN;
         }
         self.find_again(frame, scratch).unwrap_or_else(|| {
             self.state.missed += 1;
-            TargetStep::unseen(0.0)
+            TargetStep::UNSEEN
         })
     }
 

@@ -374,7 +374,7 @@ fn seen(
 /// A recording's description of one camera.
 struct RecordedCamera {
     lens: Intrinsics,
-    /// Whether its times are common times: only a calibration by a flight states a clock's wander.
+    /// Whether its times are common times ([`CameraCalibration::corrects_clock`]).
     is_corrected: bool,
     /// Whether the camera is on a mount.
     is_on_mount: bool,
