@@ -6,7 +6,7 @@ use std::ops::Range;
 use crossfix_correlation::Plane;
 
 use crate::TrackerConfig;
-use crate::coarse::{CoarseReference, coarsened};
+use crate::coarse::{CoarseReference, PictureLikeness, coarsened};
 use crate::crop::{crop, replace_invalid};
 use crate::fit::TargetFit;
 use crate::frame::FrameInput;
@@ -21,7 +21,7 @@ use crate::state::TargetBelief;
 /// lost for good, as something else is found and followed; with 0.999 an eighth more of the frames
 /// of small targets in noise are lost.
 const SURE_PLACE: f32 = 0.99;
-/// A place in what has changed (and a find of the detector, by the first of these) is accepted if its
+/// A place in a single picture (and a find of the detector, by the first of these) is accepted if its
 /// log likelihood ratio is at least `LEAST_RATIO` and at least `MARGIN` above that of the next best place, and if its contrast is by `ABOVE_CHANCE`
 /// nats likelier the target's than the best one's of all places searched. On the shared and drawn
 /// cases half of the places that such a search takes for the target are others' without the last
@@ -75,7 +75,8 @@ impl Sought<'_> {
     fn find_by_map(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetFit> {
         let coarse = CoarseReference::of(self.state, frame.image, scratch)?;
         self.remember_background(frame, &coarse, scratch);
-        let sides = whole_ratios(self.state, frame.image, &coarse, frame.config, scratch);
+        let (sides, likeness) =
+            whole_ratios(self.state, frame.image, &coarse, frame.config, scratch);
         let area = SearchArea::whole(self.state, sides, coarse.coarseness);
         let turned = frame.scene.turned();
         for y in 0..sides[1] {
@@ -90,7 +91,7 @@ impl Sought<'_> {
         let likeliest = map.likeliest(near);
         let is_sure = likeliest.probability >= SURE_PLACE;
         if !is_sure {
-            return None;
+            return self.find_in_image(frame, (&area, likeness), scratch);
         }
         let cell = [likeliest.column, likeliest.row];
         let (state, config) = (&mut *self.state, frame.config);
@@ -105,6 +106,25 @@ impl Sought<'_> {
             map.places.exclude(cell, near);
         }
         None
+    }
+
+    /// The target, if this image alone, whose log likelihood ratios are in `scratch.ratios`, shows it
+    /// clearly: one that comes out of a cloud is found in the first image, and not in the second.
+    fn find_in_image(
+        &mut self,
+        frame: FrameInput<'_>,
+        (area, likeness): (&SearchArea, PictureLikeness),
+        scratch: &mut Scratch,
+    ) -> Option<TargetFit> {
+        let (state, config) = (&mut *self.state, frame.config);
+        let best = area.best_place(&area.prior(state, config), scratch);
+        let reach = (area.coarseness + 1) as f64;
+        let peak = state.best_near(frame.image, state.noise, best.place, reach, scratch, config);
+        let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
+        let is_clear = best.margin > MARGIN && is_likely(&peak, likeness, state, config);
+        let accepted =
+            is_clear && self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0;
+        accepted.then_some(fit)
     }
 
     /// The map of the target's places, as expected of this image.
@@ -165,12 +185,9 @@ impl Sought<'_> {
         // The image itself tells the place best: the change has the noise of two pictures.
         crop(frame.image, peak.corner, peak.sides, &mut scratch.gate);
         let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
-        // A noisy reference finds the target fainter than it is, by the clear share.
-        let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
-        let accepted = peak.log_ratio > LEAST_RATIO
-            && best.margin > MARGIN
-            && likeness.log_ratio(peak.contrast, usual, config.contrast_sd) > ABOVE_CHANCE
-            && self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0;
+        let is_clear = best.margin > MARGIN && is_likely(&peak, likeness, state, config);
+        let accepted =
+            is_clear && self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0;
         accepted.then_some(fit)
     }
 
@@ -192,15 +209,28 @@ impl Sought<'_> {
     }
 }
 
+/// Whether the best placement of a picture is likelier the target than the scene's best one.
+fn is_likely(
+    peak: &BestPlacement,
+    likeness: PictureLikeness,
+    state: &TargetBelief,
+    config: &TrackerConfig,
+) -> bool {
+    // A noisy reference finds the target fainter than it is, by the clear share.
+    let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
+    peak.log_ratio > LEAST_RATIO
+        && likeness.log_ratio(peak.contrast, usual, config.contrast_sd) > ABOVE_CHANCE
+}
+
 /// Log likelihood ratios of every place of an image, made coarser, into `scratch.ratios`; returns
-/// the sides of the coarse picture.
+/// the sides of the coarse picture, and how much it looks like the target.
 fn whole_ratios(
     state: &TargetBelief,
     image: &Plane,
     coarse: &CoarseReference,
     config: &TrackerConfig,
     scratch: &mut Scratch,
-) -> [usize; 2] {
+) -> ([usize; 2], PictureLikeness) {
     let mut picture = std::mem::take(&mut scratch.search.coarse);
     coarsened(image, coarse.coarseness, &mut picture);
     replace_invalid(&mut picture);
@@ -210,10 +240,11 @@ fn whole_ratios(
     // Noise is whatever the picture's places look like the target by: where there are clouds, that
     // is more than the image's own.
     let mut expected = coarse.expectation(state, state.noise, config);
-    let likeness = coarse.likeness(scratch).deviation as f32;
-    expected.noise = expected.noise.max(likeness * likeness * expected.energy);
+    let likeness = coarse.likeness(scratch);
+    let deviation = likeness.deviation as f32;
+    expected.noise = expected.noise.max(deviation * deviation * expected.energy);
     log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
-    sides
+    (sides, likeness)
 }
 
 /// The best placement of a reference near a place.
