@@ -7,8 +7,8 @@ use crossfix_message::Timestamp;
 use crate::config::Algorithm;
 use crate::detector::{Detector, Found, KnownTarget};
 use crate::figure::meant;
+use crate::followed::{Followed, Follower, Origin, box_of, describe};
 use crate::frame::{FrameInput, TargetStep};
-use crate::tracker::{Followed, Follower, Origin, box_of, describe};
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
 };
@@ -22,8 +22,8 @@ const MOST_CANDIDATES: usize = 6;
 /// and as many fewer of a panning one's.
 const CANDIDATE_S: f64 = 0.5;
 /// For this long after it was given a target may be taken up anew where it shows, s: a video's
-/// compression hides a bird of five pixels for some images. With half of it a box with nothing in it
-/// is followed more often, with twice as much what flies into it is taken for the target.
+/// compression hides a bird of five pixels for some images. Longer, and something else may
+/// have flown into the box by then (reasoned, not measured).
 const SHOWN_WITHIN_S: f64 = 0.5;
 /// Largest ratio of a candidate's mean side to the target's, either way: of a drone before trees
 /// only the brightest part is found.

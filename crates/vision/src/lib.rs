@@ -34,6 +34,7 @@ mod detector;
 mod figure;
 mod finding;
 mod fit;
+mod followed;
 mod followed_target;
 mod frame;
 mod gate;

@@ -17,21 +17,31 @@ use crate::scratch::Scratch;
 use crate::search_memory::{Background, SearchMap, SearchMemory};
 use crate::state::TargetBelief;
 
-/// Probability in one place from which on the map has found the target. With 0.9 one drawn sequence in forty is
-/// lost for good, as something else is found and followed; with 0.999 an eighth more of the frames
-/// of small targets in noise are lost.
+/// Probability in one place from which on the map has found the target. With 0.9 one drawn sequence
+/// in forty is lost for good, as something else is found and followed; with 0.999 an eighth more of
+/// the frames of small targets in noise are lost.
 const SURE_PLACE: f32 = 0.99;
-/// A place in a single picture (and a find of the detector, by the first of these) is accepted if its
-/// log likelihood ratio is at least `LEAST_RATIO` and at least `MARGIN` above that of the next best place, and if its contrast is by `ABOVE_CHANCE`
-/// nats likelier the target's than the best one's of all places searched. On the shared and drawn
-/// cases half of the places that such a search takes for the target are others' without the last
-/// condition, and with 4 a third; with twice as much an eighth of the right ones is refused.
+/// The best place of a single picture (and a find of the detector, by the first of these) is accepted
+/// if its log likelihood ratio, less the scene's own there, is at least `LEAST_RATIO` and at least
+/// `MARGIN` above that of the next best place, and if its contrast is by `ABOVE_CHANCE` nats likelier
+/// the target's than the best one's of all places searched. On the shared and drawn cases half of the
+/// places that such a search takes for the target are others' without the last condition, and with 4 a
+/// third; with twice as much an eighth of the right ones is refused.
 pub(crate) const LEAST_RATIO: f32 = 3.0;
 const MARGIN: f32 = 1.0;
 const ABOVE_CHANCE: f64 = 4.0;
 /// Variance of the noise in the picture of what has changed, over that in the image: the image's
 /// own noise, and what interpolation leaves of the older picture's.
 const NOISE_OF_CHANGE: f32 = 1.6;
+
+/// A picture that is searched, the image or what has changed.
+#[derive(Clone, Copy)]
+struct Searched<'a> {
+    picture: &'a Plane,
+    /// Variance of its noise.
+    noise: f32,
+    likeness: PictureLikeness,
+}
 
 /// A lost target, with what is kept for its search.
 pub(crate) struct Sought<'a> {
@@ -41,28 +51,24 @@ pub(crate) struct Sought<'a> {
 }
 
 impl Sought<'_> {
-    /// Searches for it: by the map, after a second with its first appearance; and every other time
-    /// in what has changed, by turns with its last appearance and its first. It
-    /// keeps the appearance by which it is found.
+    /// Searches for it: in the image, after a second by its first appearance; and every other time in
+    /// what has changed, by turns by its last appearance and its first. It keeps the appearance by
+    /// which it is found.
     pub(crate) fn find(
         &mut self,
         frame: FrameInput<'_>,
         scratch: &mut Scratch,
     ) -> Option<TargetFit> {
         self.memory.take_first(self.state, frame.config, &mut scratch.buffers);
-        let found = self.find_by_map(frame, scratch).or_else(|| {
+        let found = self.find_in_image(frame, scratch).or_else(|| {
             self.memory.take_last(self.state);
             let searches = self.memory.searches;
             self.memory.searches += 1;
             if searches / 2 % 2 == 1 {
                 self.memory.take_first(self.state, frame.config, &mut scratch.buffers);
             }
-            let mut change = std::mem::take(&mut scratch.search.change);
-            let is_known =
-                searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
-            let found = if is_known { self.find_in_change(frame, &change, scratch) } else { None };
-            scratch.search.change = change;
-            found
+            let is_turn = searches.is_multiple_of(2);
+            if is_turn { self.find_in_change(frame, scratch) } else { None }
         });
         if found.is_none() {
             self.memory.take_last(self.state);
@@ -71,8 +77,9 @@ impl Sought<'_> {
     }
 
     /// Takes an image into the map of where the target may be; returns the target if that leaves
-    /// next to no doubt.
-    fn find_by_map(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetFit> {
+    /// next to no doubt, or if the image alone shows it clearly: one that comes out of a cloud is
+    /// found in the first image, and not in the second.
+    fn find_in_image(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetFit> {
         let coarse = CoarseReference::of(self.state, frame.image, scratch)?;
         self.remember_background(frame, &coarse, scratch);
         let (sides, likeness) =
@@ -89,42 +96,106 @@ impl Sought<'_> {
         let map = self.predicted_map(frame, &area, sides, scratch);
         map.update(&scratch.ratios);
         let likeliest = map.likeliest(near);
+        let searched = Searched { picture: frame.image, noise: self.state.noise, likeness };
         let is_sure = likeliest.probability >= SURE_PLACE;
         if !is_sure {
-            return self.find_in_image(frame, (&area, likeness), scratch);
+            let best = area.best_place(&area.prior(self.state, frame.config), scratch);
+            let background = area.background_at(best.cell, turned, self.state, self.memory);
+            return self.clear_find(frame, searched, (&area, best, background), scratch);
         }
         let cell = [likeliest.column, likeliest.row];
-        let (state, config) = (&mut *self.state, frame.config);
-        let (place, reach) = (cell.map(|at| area.middle(at)), (2 * coarse.coarseness + 1) as f64);
-        let peak = state.best_near(frame.image, state.noise, place, reach, scratch, config);
-        let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
-        if self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0 {
-            return Some(fit);
-        }
-        // It belongs to the scene.
-        if let Some(map) = &mut self.memory.map {
+        let (place, reach) = (area.place_of(cell), 2 * area.coarseness + 1);
+        let (_, fit) = self.at_full_resolution(frame, searched, (place, reach), scratch);
+        let has_come = self.has_come(frame, &fit, scratch);
+        if let Some(map) = self.memory.map.as_mut().filter(|_| !has_come) {
+            // It belongs to the scene.
             map.places.exclude(cell, near);
         }
-        None
+        has_come.then_some(fit)
     }
 
-    /// The target, if this image alone, whose log likelihood ratios are in `scratch.ratios`, shows it
-    /// clearly: one that comes out of a cloud is found in the first image, and not in the second.
-    fn find_in_image(
+    fn find_in_change(
         &mut self,
         frame: FrameInput<'_>,
-        (area, likeness): (&SearchArea, PictureLikeness),
         scratch: &mut Scratch,
     ) -> Option<TargetFit> {
-        let (state, config) = (&mut *self.state, frame.config);
+        let mut change = std::mem::take(&mut scratch.search.change);
+        let is_known = frame.scene.change(frame.image, &mut change);
+        let found =
+            if is_known { self.find_in_picture_of_change(frame, &change, scratch) } else { None };
+        scratch.search.change = change;
+        found
+    }
+
+    /// Searches the picture of what has changed, in which the scene has cancelled.
+    fn find_in_picture_of_change(
+        &mut self,
+        frame: FrameInput<'_>,
+        change: &Plane,
+        scratch: &mut Scratch,
+    ) -> Option<TargetFit> {
+        let (state, config) = (&*self.state, frame.config);
+        let noise = NOISE_OF_CHANGE * state.noise;
+        let coarse = CoarseReference::of(state, change, scratch)?;
+        let area = SearchArea::about(state, change, coarse.coarseness, config);
+        let mut picture = std::mem::take(&mut scratch.search.coarse);
+        coarsened(change, coarse.coarseness, &mut picture);
+        replace_invalid(&mut picture);
+        coarse.correlate(&picture, &area.ranges, scratch);
+        scratch.search.coarse = picture;
+        let expected = coarse.expectation(state, noise, config);
+        log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
+        let searched = Searched { picture: change, noise, likeness: coarse.likeness(scratch) };
         let best = area.best_place(&area.prior(state, config), scratch);
-        let reach = (area.coarseness + 1) as f64;
-        let peak = state.best_near(frame.image, state.noise, best.place, reach, scratch, config);
+        self.clear_find(frame, searched, (&area, best, 0.0), scratch)
+    }
+
+    /// The target at the best place of one picture, if that is clearly its place. `background` is
+    /// the scene's own log likelihood ratio there.
+    fn clear_find(
+        &mut self,
+        frame: FrameInput<'_>,
+        searched: Searched<'_>,
+        (area, best, background): (&SearchArea, Best, f32),
+        scratch: &mut Scratch,
+    ) -> Option<TargetFit> {
+        let at = (area.place_of(best.cell), area.coarseness + 1);
+        let (peak, fit) = self.at_full_resolution(frame, searched, at, scratch);
+        let state = &*self.state;
+        // A noisy reference finds the target fainter than it is, by the clear share.
+        let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
+        let likelier = searched.likeness.log_ratio(peak.contrast, usual, frame.config.contrast_sd);
+        let is_clear = peak.log_ratio - background > LEAST_RATIO
+            && best.margin > MARGIN
+            && likelier > ABOVE_CHANCE;
+        (is_clear && self.has_come(frame, &fit, scratch)).then_some(fit)
+    }
+
+    /// The best placement within `reach` px of a place in a picture, and the fit in the image there:
+    /// the image tells the place best, what has changed has the noise of two pictures.
+    fn at_full_resolution(
+        &mut self,
+        frame: FrameInput<'_>,
+        searched: Searched<'_>,
+        (place, reach): ([f64; 2], usize),
+        scratch: &mut Scratch,
+    ) -> (BestPlacement, TargetFit) {
+        let (state, config) = (&mut *self.state, frame.config);
+        let Searched { picture, noise, .. } = searched;
+        let peak = state.best_near(picture, noise, place, reach as f64, scratch, config);
+        crop(frame.image, peak.corner, peak.sides, &mut scratch.gate);
         let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
-        let is_clear = best.margin > MARGIN && is_likely(&peak, likeness, state, config);
-        let accepted =
-            is_clear && self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0;
-        accepted.then_some(fit)
+        (peak, fit)
+    }
+
+    /// Whether what is found has come to its place, and does not belong to the scene.
+    fn has_come(
+        &mut self,
+        frame: FrameInput<'_>,
+        found: &TargetFit,
+        scratch: &mut Scratch,
+    ) -> bool {
+        self.identity.arrival_log_ratio(self.state, frame, found.place, scratch) >= 0.0
     }
 
     /// The map of the target's places, as expected of this image.
@@ -159,38 +230,6 @@ impl Sought<'_> {
         &mut self.memory.map.insert(map).places
     }
 
-    fn find_in_change(
-        &mut self,
-        frame: FrameInput<'_>,
-        change: &Plane,
-        scratch: &mut Scratch,
-    ) -> Option<TargetFit> {
-        let (state, config) = (&mut *self.state, frame.config);
-        let noise = NOISE_OF_CHANGE * state.noise;
-        let coarse = CoarseReference::of(state, change, scratch)?;
-        let area = SearchArea::about(state, change, coarse.coarseness, config);
-        let mut picture = std::mem::take(&mut scratch.search.coarse);
-        coarsened(change, coarse.coarseness, &mut picture);
-        replace_invalid(&mut picture);
-        coarse.correlate(&picture, &area.ranges, scratch);
-        scratch.search.coarse = picture;
-        let expected = coarse.expectation(state, noise, config);
-        log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
-        let likeness = coarse.likeness(scratch);
-        let best = area.best_place(&area.prior(state, config), scratch);
-
-        // Once more at full resolution, about the place of the coarse search.
-        let reach = (coarse.coarseness + 1) as f64;
-        let peak = state.best_near(change, noise, best.place, reach, scratch, config);
-        // The image itself tells the place best: the change has the noise of two pictures.
-        crop(frame.image, peak.corner, peak.sides, &mut scratch.gate);
-        let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
-        let is_clear = best.margin > MARGIN && is_likely(&peak, likeness, state, config);
-        let accepted =
-            is_clear && self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0;
-        accepted.then_some(fit)
-    }
-
     /// Notes the log likelihood ratios of the scene itself, from the snapshot, once per loss.
     fn remember_background(
         &mut self,
@@ -207,19 +246,6 @@ impl Sought<'_> {
         let (ratios, turned) = (scratch.ratios.clone(), frame.scene.turned());
         *background = Some(Background { coarseness, ratios, turned });
     }
-}
-
-/// Whether the best placement of a picture is likelier the target than the scene's best one.
-fn is_likely(
-    peak: &BestPlacement,
-    likeness: PictureLikeness,
-    state: &TargetBelief,
-    config: &TrackerConfig,
-) -> bool {
-    // A noisy reference finds the target fainter than it is, by the clear share.
-    let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
-    peak.log_ratio > LEAST_RATIO
-        && likeness.log_ratio(peak.contrast, usual, config.contrast_sd) > ABOVE_CHANCE
 }
 
 /// Log likelihood ratios of every place of an image, made coarser, into `scratch.ratios`; returns
@@ -314,8 +340,8 @@ impl TargetBelief {
 
 /// The best placement on the coarse picture.
 struct Best {
-    /// Its middle, px of the full picture.
-    place: [f64; 2],
+    /// Its column and row.
+    cell: [usize; 2],
     /// Its log likelihood ratio, less that of the next best place.
     margin: f32,
 }
@@ -434,10 +460,7 @@ impl SearchArea {
             }
         }
         let (column, row) = (ranges[0].start + best[0], ranges[1].start + best[1]);
-        Best {
-            place: [self.middle(column), self.middle(row)],
-            margin: scratch.ratios.row(best[1])[best[0]] - rival,
-        }
+        Best { cell: [column, row], margin: scratch.ratios.row(best[1])[best[0]] - rival }
     }
 
     /// Log likelihood ratio that the scene itself had at a place of the coarse picture, given how it
@@ -460,6 +483,11 @@ impl SearchArea {
         let [column, row] =
             then.map(|then| ((then + 0.5) / self.coarseness as f64 - 0.5).round() as isize);
         background.ratios.clamped(column, row).max(0.0)
+    }
+
+    /// The middle of a cell of the coarse picture, px of the full picture.
+    fn place_of(&self, cell: [usize; 2]) -> [f64; 2] {
+        cell.map(|index| self.middle(index))
     }
 
     /// The middle of a column or row of the coarse picture, px of the full picture.

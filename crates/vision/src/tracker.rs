@@ -4,9 +4,8 @@ use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
 use crate::detector::Detector;
-use crate::followed_target::Target;
-use crate::frame::{FrameInput, Measurement, TargetStep};
-use crate::paper::PaperTarget;
+use crate::followed::{Followed, Follower, Origin, describe};
+use crate::frame::{FrameInput, Measurement};
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
 use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
@@ -58,137 +57,6 @@ pub struct ImageTrack {
     /// Normalised innovation squared, summed over both axes: chi-square with two degrees of freedom
     /// if the filters are consistent; absent if nothing was predicted.
     pub nis: Option<f64>,
-}
-
-/// Who took a target up.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Origin {
-    /// A person or a configuration: it is never given up.
-    Given,
-    /// The detector.
-    Detected {
-        /// Where it was found, and how far the scene had moved then, px.
-        first: ImagePoint,
-        turned: [f64; 2],
-        /// Whether it has been elsewhere since or before, both in the image and in the scene, so
-        /// that the background of its place is known without it: what keeps to its place in the
-        /// image is on the lens, or written into the video.
-        has_moved: bool,
-        /// Whether it is followed only because it may be a target that is lost: a candidate has no
-        /// track of its own.
-        is_candidate: bool,
-    },
-}
-
-/// A target as one of the algorithms follows it.
-#[derive(Debug)]
-pub(crate) enum Follower {
-    Posterior(Box<Target>),
-    Paper(Box<PaperTarget>),
-}
-
-impl Follower {
-    pub(crate) fn new(
-        image: &Plane,
-        place: PixelBox,
-        scratch: &mut Scratch,
-        config: &TrackerConfig,
-    ) -> Self {
-        match config.algorithm {
-            Algorithm::Posterior => {
-                Self::Posterior(Box::new(Target::new(image, place, scratch, config)))
-            }
-            Algorithm::Paper => Self::Paper(Box::new(PaperTarget::new(image, place, config))),
-        }
-    }
-
-    fn step(
-        &mut self,
-        frame: FrameInput<'_>,
-        cue: Option<ImagePoint>,
-        scratch: &mut Scratch,
-    ) -> TargetStep {
-        match (self, cue) {
-            (Self::Posterior(target), None) => target.step(frame, scratch),
-            (Self::Posterior(target), Some(place)) => target.take_place(frame, place, scratch),
-            (Self::Paper(target), None) => {
-                target.step(frame.image, frame.interval, scratch, frame.config)
-            }
-            (Self::Paper(target), Some(place)) => {
-                target.take_place(frame.image, place, frame.interval, frame.config)
-            }
-        }
-    }
-
-    pub(crate) fn position(&self) -> ImagePoint {
-        match self {
-            Self::Posterior(target) => target.state.position(),
-            Self::Paper(target) => target.position(),
-        }
-    }
-
-    fn velocity(&self) -> ImagePoint {
-        match self {
-            Self::Posterior(target) => target.state.velocity(),
-            Self::Paper(target) => target.velocity(),
-        }
-    }
-
-    fn covariances(&self) -> Option<[Matrix2<f64>; 2]> {
-        match self {
-            Self::Posterior(target) => Some(target.covariances()),
-            Self::Paper(target) => target.axes().map(|[x, y]| [x.covariance(), y.covariance()]),
-        }
-    }
-
-    /// Width and height of the target, px.
-    pub(crate) fn size(&self) -> [f64; 2] {
-        match self {
-            Self::Posterior(target) => target.state.appearance.sides(),
-            Self::Paper(target) => target.size,
-        }
-    }
-
-    fn is_lost(&self) -> bool {
-        matches!(self, Self::Posterior(target) if target.is_lost())
-    }
-
-    pub(crate) fn is_searching(&self) -> bool {
-        matches!(self, Self::Posterior(target) if target.state.is_searching())
-    }
-
-    pub(crate) fn is_seen(&self) -> bool {
-        !matches!(self, Self::Posterior(target) if target.state.unseen_s > 0.0 || target.identity.is_on_probation())
-    }
-}
-
-#[derive(Debug)]
-pub(crate) struct Followed {
-    pub(crate) id: ImageTrackId,
-    pub(crate) origin: Origin,
-    pub(crate) target: Follower,
-    pub(crate) measured_at: Timestamp,
-    /// When it was last searched for.
-    pub(crate) searched: Option<Timestamp>,
-    /// Its place in the next image, if somebody has told it.
-    pub(crate) cue: Option<ImagePoint>,
-    /// Since when it has been followed.
-    pub(crate) since: Timestamp,
-    /// The candidate that is shown in its place while it is lost.
-    pub(crate) stand_in: Option<ImageTrackId>,
-    /// The box by which somebody has given it, if nothing stood out there.
-    pub(crate) unshown: Option<PixelBox>,
-}
-
-impl Followed {
-    pub(crate) fn is_candidate(&self) -> bool {
-        matches!(self.origin, Origin::Detected { is_candidate: true, .. })
-    }
-
-    /// Whether it was found by the detector, and has been elsewhere since.
-    pub(crate) fn has_moved(&self) -> bool {
-        matches!(self.origin, Origin::Detected { has_moved: true, .. })
-    }
 }
 
 /// A candidate that keeps to its place for this long is dropped, s: a target that can be told from
@@ -486,36 +354,9 @@ impl ImageTracker {
     }
 }
 
-pub(crate) fn box_of(target: &Follower) -> PixelBox {
-    let [width, height] = target.size();
-    PixelBox::about(target.position(), width, height)
-}
-
 /// Whether two targets lie on each other: their centres within half a box.
 fn same(one: &Follower, other: &Follower) -> bool {
     let (a, b) = (one.position(), other.position());
     let ([aw, ah], [bw, bh]) = (one.size(), other.size());
     (a.x - b.x).abs() < aw.max(bw) / 2.0 && (a.y - b.y).abs() < ah.max(bh) / 2.0
-}
-
-pub(crate) fn describe(
-    id: ImageTrackId,
-    target: &Follower,
-    phase: TrackPhase,
-    step: TargetStep,
-) -> ImageTrack {
-    let [width, height] = target.size();
-    ImageTrack {
-        id,
-        phase,
-        position: target.position(),
-        velocity: target.velocity(),
-        covariances: target.covariances(),
-        measured: step.measured,
-        width,
-        height,
-        score: step.score,
-        certainty: step.certainty,
-        nis: step.nis,
-    }
 }
