@@ -276,11 +276,11 @@ impl CameraCalibration {
         self
     }
 
-    /// Whether the times of bearings that are published with it are corrected already: it comes from
-    /// a fit of the camera's clock too (to a flight, or before an import), which alone states a
-    /// clock's wander.
+    /// Whether it comes from a flight, which corrects the camera's clock too: the times of bearings
+    /// that are published with it are corrected already. A flight alone states both how the noise
+    /// lasts and how the clock wanders.
     pub fn corrects_clock(&self) -> bool {
-        self.datum.is_some() || self.clock_wander_s > 0.0
+        self.datum.is_some() || (self.clock_wander_s > 0.0 && self.lasting_noise_s > 0.0)
     }
 
     /// The same calibration with the uncertainty of the site as a whole.
@@ -422,6 +422,17 @@ mod tests {
             assert!((ours - theirs).abs() < 1e-12);
         }
         assert_eq!(message.hash, message.content_hash());
+    }
+
+    #[test]
+    fn a_flight_has_corrected_the_clock_and_who_knows_that_it_wanders_has_not() {
+        let noise = LastingNoise { sd_rad: 1e-3, time_s: 0.5 };
+        assert!(message().with_lasting_errors(noise, 1e-3).corrects_clock());
+        assert!(!message().with_lasting_errors(noise, 0.0).corrects_clock());
+        let wanders = message().with_clock_wander(2e-3);
+        assert!(!wanders.corrects_clock());
+        assert_eq!(wanders.hash, wanders.content_hash());
+        assert_eq!(wanders.parse().unwrap().clock_wander_s, 2e-3);
     }
 
     fn mounted() -> CameraCalibration {
