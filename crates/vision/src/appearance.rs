@@ -217,6 +217,17 @@ impl Appearance {
         appearance
     }
 
+    /// The same where the image that it was made of was the mean of so many.
+    pub(crate) fn of_images(self, images: f32) -> Self {
+        Self { adaptation: self.adaptation.after(images), anchor_images: images, ..self }
+    }
+
+    /// Whether the anchor is not clear of noise yet, so that images are still averaged into it.
+    pub(crate) fn is_anchor_noisy(&self) -> bool {
+        let pixels = self.anchor.samples().len() as f32;
+        self.anchor_noise * pixels > ANCHOR_NOISE_SHARE * energy(&self.anchor)
+    }
+
     /// Correlation coefficient of two appearances, each in its size and direction, their noise
     /// taken out.
     pub(crate) fn likeness(&self, other: &Self) -> f32 {
@@ -310,9 +321,7 @@ impl Appearance {
         let mut anchor_share = 0.0;
 
         // The anchor learns too, until noise is a small share of its energy.
-        let noise_share =
-            self.anchor_noise * view.samples().len() as f32 / energy(&self.anchor).max(1e-12);
-        if noise_share > ANCHOR_NOISE_SHARE {
+        if self.is_anchor_noisy() {
             // Running mean, each image weighted by its certainty; its noise is (1 - s)^2 v + s^2
             // v_new.
             anchor_share = certainty / (self.anchor_images + 1.0);

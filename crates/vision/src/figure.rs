@@ -209,6 +209,11 @@ fn depths(landscape: &Plane) -> Plane {
     Plane::from_fn(width, height, |x, y| surface.row(y)[x] - landscape.row(y)[x])
 }
 
+/// How far beyond a given box its figure is looked for, px; `given_sd` as in [`meant`].
+pub(crate) fn farthest(given_sd: f64) -> f64 {
+    FURTHEST * given_sd + GROUND_PX
+}
+
 /// The box of the target that somebody meant by a given box: the given one where it fits the one
 /// thing that stands out there, and else that of the thing; `None` if nothing stands out, or more
 /// than one thing does.
@@ -223,7 +228,7 @@ pub(crate) fn meant(
 ) -> Option<PixelBox> {
     let windows = (0..WINDOWS).rev().map(|window| f64::from(window) / f64::from(WINDOWS - 1));
     let mut figures = windows.filter_map(|share| {
-        figure_within(image, given, given_sd, share * (FURTHEST * given_sd + GROUND_PX), noise_sd)
+        figure_within(image, given, given_sd, share * farthest(given_sd), noise_sd)
     });
     // From the widest window down: the first that shows a single thing decides.
     figures.next().map(|figure| if fits(given, figure) { given } else { figure })

@@ -47,7 +47,9 @@ impl Follower {
     ) -> Self {
         match config.algorithm {
             Algorithm::Posterior => {
-                Self::Posterior(Box::new(Target::new(image, place, scratch, config)))
+                let mut target = Box::new(Target::new(image, place, scratch, config));
+                target.state.begin_centring(config);
+                Self::Posterior(target)
             }
             Algorithm::Paper => Self::Paper(Box::new(PaperTarget::new(image, place, config))),
         }

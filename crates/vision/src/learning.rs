@@ -30,7 +30,7 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
 
 impl TargetBelief {
     /// Learns contrast, size, direction and appearance from an image, the more the surer the target
-    /// was seen.
+    /// was seen. Returns whether the reference has another middle now.
     pub(crate) fn learn(
         &mut self,
         frame: FrameInput<'_>,
@@ -38,10 +38,10 @@ impl TargetBelief {
         fit: TargetFit,
         certainty: f64,
         scratch: &mut Scratch,
-    ) {
-        let FrameInput { image, interval, .. } = frame;
+    ) -> bool {
+        let FrameInput { image, interval, config, .. } = frame;
         if certainty < LEAST_CERTAINTY[0] {
-            return;
+            return false;
         }
         let seen = certainty > SEEN;
         if seen {
@@ -61,18 +61,19 @@ impl TargetBelief {
             self.usual_contrast += share * (self.contrast - self.usual_contrast);
         }
         let certainty = certainty * ramp(fit.score, LEARNING_SCORES);
-        if certainty >= LEAST_CERTAINTY[1] {
-            // Size and direction take effect only with the learning; without it they would run
-            // away.
-            if seen && self.appearance.is_in_shape() {
-                self.follow_shape(fit);
-            }
-            let (certainty, buffers) = (certainty as f32, &mut scratch.buffers);
-            let share =
-                self.appearance.learn(image, place, self.noise, certainty, interval, buffers);
-            let variances = [fit.covariance.m11, fit.covariance.m22];
-            self.motion.learn(place, f64::from(share), Some(variances));
+        if certainty < LEAST_CERTAINTY[1] {
+            return false;
         }
+        // Size and direction take effect only with the learning; without it they would run
+        // away.
+        if seen && self.appearance.is_in_shape() {
+            self.follow_shape(fit);
+        }
+        let (certainty, buffers) = (certainty as f32, &mut scratch.buffers);
+        let share = self.appearance.learn(image, place, self.noise, certainty, interval, buffers);
+        let variances = [fit.covariance.m11, fit.covariance.m22];
+        self.motion.learn(place, f64::from(share), Some(variances));
+        self.centre(image, (place, certainty), scratch, config)
     }
 
     fn follow_shape(&mut self, fit: TargetFit) {

@@ -27,6 +27,7 @@
 
 mod appearance;
 mod arrival;
+mod centring;
 mod coarse;
 mod config;
 mod crop;

@@ -8,6 +8,7 @@ use crossfix_correlation::Plane;
 use crossfix_filter::AxisMeasurement;
 
 use crate::appearance::Appearance;
+use crate::centring::Surroundings;
 use crate::crop::crop;
 use crate::frame::{FRAME_INTERVAL, FrameInput};
 use crate::likelihood::Expectation;
@@ -48,6 +49,8 @@ pub(crate) struct TargetBelief {
     pub(crate) last_seen: ImagePoint,
     /// Whether it has not been seen yet but where it was given.
     pub(crate) is_new: bool,
+    /// What is about it, as long as nothing has stood out in its place.
+    pub(crate) surroundings: Option<Box<Surroundings>>,
     /// Its place in the tracker's snapshot picture.
     pub(crate) in_snapshot: Option<ImagePoint>,
 }
@@ -86,6 +89,7 @@ impl TargetBelief {
             unseen_s: 0.0,
             last_seen: centre,
             is_new: true,
+            surroundings: None,
             in_snapshot: None,
         }
     }

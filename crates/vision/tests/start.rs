@@ -154,3 +154,28 @@ fn what_does_not_show_in_the_image_of_its_box_is_taken_up_when_it_does() {
         }
     }
 }
+
+/// A box beside a target that no image shows: its reference is made of the target's edge and of
+/// noise. Once their mean shows the target, the reference is put on its middle.
+#[test]
+fn a_box_beside_a_target_that_no_single_image_shows_is_put_right_by_their_mean() {
+    const RUNS: u64 = 8;
+    let mut put_right = 0;
+    for run in 0..RUNS {
+        let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
+        let mut last = None;
+        for frame in 0..120_u64 {
+            let t = frame as f32 / 30.0;
+            // A peak of five levels in noise of two.
+            let spot = Spot { x: 50.0 + 15.0 * t, y: 60.0 + 6.0 * (1.3 * t).sin(), contrast: -5.0 };
+            let image = sky(1000 * run + frame, &[spot], is_sky);
+            if frame == 0 {
+                tracker.take_up(drawn(spot, [0.0, 3.0], 1.0));
+            }
+            let tracks = tracker.step(&image, Timestamp::from_seconds(f64::from(t)));
+            last = Some(off(&tracks[0], spot));
+        }
+        put_right += u64::from(last.unwrap() < 1.5);
+    }
+    assert!(put_right >= RUNS - 1, "{put_right} of {RUNS}");
+}

@@ -15,6 +15,7 @@ const CONTINUES_IMAGES: u32 = 20;
 impl Target {
     pub(super) fn search(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> TargetStep {
         self.state.forget_contrast(frame.interval);
+        self.state.forget_surroundings();
         if !frame.may_search {
             self.state.missed += 1;
             return TargetStep::UNSEEN;

@@ -302,8 +302,10 @@ impl Target {
         certainty: f64,
         scratch: &mut Scratch,
     ) {
-        if !self.identity.is_on_probation() {
-            self.state.learn(frame, place, fit, certainty, scratch);
+        let may_learn = !self.identity.is_on_probation();
+        if may_learn && self.state.learn(frame, place, fit, certainty, scratch) {
+            // The other places are those of the reference as it was cut out before.
+            self.hypotheses.clear();
         }
     }
 }
