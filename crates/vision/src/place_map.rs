@@ -151,7 +151,7 @@ impl PlaceMap {
 
 /// The sum of all samples: millions of them, in single precision, would be off by a percent.
 fn sum(cells: &Plane) -> f64 {
-    (0..cells.height()).map(|y| f64::from(cells.row(y).iter().sum::<f32>())).sum()
+    (0..cells.height()).map(|y| f64::from(lanes::sum(cells.row(y)))).sum()
 }
 
 /// The means of squares of `2 half + 1` cells, moved by whole cells; nothing comes from beyond the
@@ -188,13 +188,23 @@ fn spread(from: &Plane, half: usize, [right, down]: [isize; 2], buffers: &mut Sp
             sum
         }));
         let out = to.row_mut(y as usize);
-        for x in 0..width {
+        // What is left of differences of sums may be a rounding error below 0.
+        let mean = |square: f64| (share * square.max(0.0)) as f32;
+        // Columns whose square is cut by no border take both sums from slices, ...
+        let first = right.saturating_add(half).clamp(0, width);
+        let end = right.saturating_add(width - half).clamp(first, width);
+        if first < end {
+            let low = &before[(first - right - half) as usize..];
+            let sums = low.iter().zip(&low[2 * half as usize + 1..]);
+            let columns = &mut out[first as usize..end as usize];
+            columns.iter_mut().zip(sums).for_each(|(out, (low, high))| *out = mean(high - low));
+        }
+        // ... and the others at clamped places.
+        for x in (0..first).chain(end..width) {
             let middle = x.saturating_sub(right);
-            let first = middle.saturating_sub(half).clamp(0, width);
-            let end = middle.saturating_add(half + 1).clamp(first, width);
-            // What is left of differences of sums may be a rounding error below 0.
-            let square = before[end as usize] - before[first as usize];
-            out[x as usize] = (share * square.max(0.0)) as f32;
+            let low = middle.saturating_sub(half).clamp(0, width);
+            let high = middle.saturating_add(half + 1).clamp(low, width);
+            out[x as usize] = mean(before[high as usize] - before[low as usize]);
         }
     }
 }

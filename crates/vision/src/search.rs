@@ -11,6 +11,7 @@ use crate::crop::{crop, replace_invalid};
 use crate::fit::TargetFit;
 use crate::frame::FrameInput;
 use crate::identity::Identity;
+use crate::lanes::greatest;
 use crate::likelihood::log_ratios;
 use crate::place_map::PlaceMap;
 use crate::scratch::Scratch;
@@ -86,11 +87,8 @@ impl Sought<'_> {
             whole_ratios(self.state, frame.image, &coarse, frame.config, scratch);
         let area = SearchArea::whole(self.state, sides, coarse.coarseness);
         let turned = frame.scene.turned();
-        for y in 0..sides[1] {
-            for (x, ratio) in scratch.ratios.row_mut(y).iter_mut().enumerate() {
-                // The reference found this much of the target in the empty scene already.
-                *ratio -= area.background_at([x, y], turned, self.state, self.memory);
-            }
+        if let Some(scene) = area.empty_scene(sides, turned, self.state, self.memory) {
+            scene.subtract_from(&mut scratch.ratios);
         }
         let near = area.near();
         let map = self.predicted_map(frame, &area, sides, scratch);
@@ -100,7 +98,8 @@ impl Sought<'_> {
         let is_sure = likeliest.probability >= SURE_PLACE;
         if !is_sure {
             let best = area.best_place(&area.prior(self.state, frame.config), scratch);
-            let background = area.background_at(best.cell, turned, self.state, self.memory);
+            let scene = area.empty_scene(sides, turned, self.state, self.memory);
+            let background = scene.map_or(0.0, |scene| scene.at(best.cell));
             return self.clear_find(frame, searched, (&area, best, background), scratch);
         }
         let cell = [likeliest.column, likeliest.row];
@@ -368,6 +367,46 @@ impl AreaPrior {
     }
 }
 
+/// The scene without the target, as a search sees it.
+struct EmptyScene<'a> {
+    /// The scene's own log likelihood ratios, in the picture that was taken of it.
+    ratios: &'a Plane,
+    /// By how many cells it has moved since.
+    by: [isize; 2],
+    /// Columns and rows of the cells that the target hid then.
+    hidden: [Range<usize>; 2],
+}
+
+impl EmptyScene<'_> {
+    /// The scene's own ratio in a cell; 0 where the target hid it, and where it is unlike the
+    /// target.
+    fn at(&self, [column, row]: [usize; 2]) -> f32 {
+        if self.hidden[0].contains(&column) && self.hidden[1].contains(&row) {
+            return 0.0;
+        }
+        let [column, row] = [column as isize + self.by[0], row as isize + self.by[1]];
+        self.ratios.clamped(column, row).max(0.0)
+    }
+
+    /// Subtracts the scene's own ratios: the reference found this much of the target in the empty
+    /// scene already.
+    fn subtract_from(&self, ratios: &mut Plane) {
+        let last = [self.ratios.width(), self.ratios.height()].map(|side| side as isize - 1);
+        let width = ratios.width();
+        for y in 0..ratios.height() {
+            let scene = self.ratios.row((y as isize + self.by[1]).clamp(0, last[1]) as usize);
+            let hidden = if self.hidden[1].contains(&y) { self.hidden[0].clone() } else { 0..0 };
+            let row = ratios.row_mut(y);
+            for columns in [0..hidden.start, hidden.end..width] {
+                for (x, ratio) in columns.clone().zip(&mut row[columns]) {
+                    let column = (x as isize + self.by[0]).clamp(0, last[0]) as usize;
+                    *ratio -= scene[column].max(0.0);
+                }
+            }
+        }
+    }
+}
+
 /// The area in which a target is searched for.
 struct SearchArea {
     /// Columns and rows of the coarse picture.
@@ -436,11 +475,17 @@ impl SearchArea {
     fn best_place(&self, prior: &AreaPrior, scratch: &Scratch) -> Best {
         let Self { ranges, .. } = self;
         let (mut best, mut most) = ([0, 0], f64::NEG_INFINITY);
+        let most_prior = prior.most().ln();
         for (y, row) in ranges[1].clone().enumerate() {
+            let ratios = scratch.ratios.row(y);
+            // If even the largest prior does not reach the best, the row and the logarithm are
+            // spared.
+            if f64::from(greatest(ratios)) + most_prior <= most {
+                continue;
+            }
             for (x, column) in ranges[0].clone().enumerate() {
-                let ratio = f64::from(scratch.ratios.row(y)[x]);
-                // If even the largest prior does not reach the best, the logarithm is spared.
-                if ratio + prior.most().ln() <= most {
+                let ratio = f64::from(ratios[x]);
+                if ratio + most_prior <= most {
                     continue;
                 }
                 let score = ratio + prior.density([self.middle(column), self.middle(row)]).ln();
@@ -453,36 +498,41 @@ impl SearchArea {
         // The next best place, away from the best, for the margin.
         let mut rival = f32::NEG_INFINITY;
         for y in 0..scratch.ratios.height() {
-            for (x, ratio) in scratch.ratios.row(y).iter().enumerate() {
-                if x.abs_diff(best[0]) > near[0] || y.abs_diff(best[1]) > near[1] {
-                    rival = rival.max(*ratio);
-                }
-            }
+            let row = scratch.ratios.row(y);
+            let beside = if y.abs_diff(best[1]) > near[1] {
+                greatest(row)
+            } else {
+                let before = &row[..best[0].saturating_sub(near[0])];
+                let after = &row[(best[0] + near[0] + 1).min(row.len())..];
+                greatest(before).max(greatest(after))
+            };
+            rival = rival.max(beside);
         }
         let (column, row) = (ranges[0].start + best[0], ranges[1].start + best[1]);
         Best { cell: [column, row], margin: scratch.ratios.row(best[1])[best[0]] - rival }
     }
 
-    /// Log likelihood ratio that the scene itself had at a place of the coarse picture, given how it
-    /// has turned by now; 0 where the target hid it, and where nothing is known of it.
-    fn background_at(
+    /// What the scene itself had at the places of a coarse picture with these sides, given how it
+    /// has turned by now; `None` if nothing is known of it.
+    fn empty_scene<'a>(
         &self,
-        at: [usize; 2],
+        picture: [usize; 2],
         turned: [f64; 2],
         state: &TargetBelief,
-        memory: &SearchMemory,
-    ) -> f32 {
-        let (Some(background), Some(seen)) = (&memory.background, state.in_snapshot) else {
-            return 0.0;
-        };
-        let then = [0, 1].map(|i| self.middle(at[i]) + turned[i] - background.turned[i]);
-        let [dx, dy] = [then[0] - seen.x, then[1] - seen.y].map(f64::abs);
-        if dx <= self.sides[0] as f64 && dy <= self.sides[1] as f64 {
-            return 0.0;
-        }
-        let [column, row] =
-            then.map(|then| ((then + 0.5) / self.coarseness as f64 - 0.5).round() as isize);
-        background.ratios.clamped(column, row).max(0.0)
+        memory: &'a SearchMemory,
+    ) -> Option<EmptyScene<'a>> {
+        let (background, seen) = (memory.background.as_ref()?, state.in_snapshot?);
+        let shift = [0, 1].map(|i| turned[i] - background.turned[i]);
+        let hidden = [0, 1].map(|i| {
+            let (reach, seen) = (self.sides[i] as f64, [seen.x, seen.y][i]);
+            let off = |index: usize| self.middle(index) + shift[i] - seen;
+            let first = (0..picture[i]).find(|index| off(*index) >= -reach);
+            let first = first.unwrap_or(picture[i]);
+            let end = (first..picture[i]).find(|index| off(*index) > reach);
+            first..end.unwrap_or(picture[i])
+        });
+        let by = shift.map(|shift| (shift / self.coarseness as f64).round() as isize);
+        Some(EmptyScene { ratios: &background.ratios, by, hidden })
     }
 
     /// The middle of a cell of the coarse picture, px of the full picture.
