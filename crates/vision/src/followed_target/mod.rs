@@ -37,9 +37,9 @@ const MANOEUVRE: f64 = 25.0;
 /// ten.
 const MOST_INFLATED: f64 = 1e4;
 /// Most placements on one side of the middle, columns times rows, among which a target in doubt is
-/// looked for: a gate of 200 by 200 px takes 5 ms. Without it the gate grows to the whole image, and
-/// takes 60. With half of it targets in noise are lost sooner.
-const MOST_IN_DOUBT: usize = 10_000;
+/// looked for: a gate of 280 by 280 px takes 10 ms. Without it the gate grows to the whole image, and
+/// takes 60. With half of it small targets in noise are lost sooner.
+const MOST_IN_DOUBT: usize = 20_000;
 /// Certainty above which the rest of the gate is not looked at: what is there could take no more
 /// from it than this leaves.
 const SURE: f64 = 0.99;
