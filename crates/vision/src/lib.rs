@@ -54,6 +54,7 @@ mod registration;
 mod scene;
 mod scratch;
 mod search;
+mod search_area;
 mod search_memory;
 mod sighting;
 mod state;

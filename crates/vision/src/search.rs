@@ -1,8 +1,6 @@
 //! Search for a lost target: in the image, where a map keeps what all images so far say of every
 //! place, and in what has changed, where no cloud is.
 
-use std::ops::Range;
-
 use crossfix_correlation::Plane;
 
 use crate::TrackerConfig;
@@ -11,10 +9,10 @@ use crate::crop::{crop, replace_invalid};
 use crate::fit::TargetFit;
 use crate::frame::FrameInput;
 use crate::identity::Identity;
-use crate::lanes::greatest;
 use crate::likelihood::log_ratios;
 use crate::place_map::PlaceMap;
 use crate::scratch::Scratch;
+use crate::search_area::{Best, SearchArea};
 use crate::search_memory::{Background, SearchMap, SearchMemory};
 use crate::state::TargetBelief;
 
@@ -334,215 +332,5 @@ impl TargetBelief {
         let gate = self.half_gate(image, config);
         let most = [image.width(), image.height()];
         [0, 1].map(|i| (gate[i] as f64).max(sides[i] as f64 + grown).min(most[i] as f64))
-    }
-}
-
-/// The best placement on the coarse picture.
-struct Best {
-    /// Its column and row.
-    cell: [usize; 2],
-    /// Its log likelihood ratio, less that of the next best place.
-    margin: f32,
-}
-
-/// Prior of a lost target's place, per px^2: `(1 - a) N(place; predicted, variances) + a / area`,
-/// with a the share that is anywhere.
-struct AreaPrior {
-    predicted: [f64; 2],
-    variances: [f64; 2],
-    /// Greatest density of the first part, and the density of the second.
-    near: f64,
-    anywhere: f64,
-}
-
-impl AreaPrior {
-    fn density(&self, place: [f64; 2]) -> f64 {
-        let off = [0, 1].map(|i| (place[i] - self.predicted[i]).powi(2) / self.variances[i]);
-        self.near * (-0.5 * (off[0] + off[1])).exp() + self.anywhere
-    }
-
-    /// The greatest density.
-    fn most(&self) -> f64 {
-        self.near + self.anywhere
-    }
-}
-
-/// The scene without the target, as a search sees it.
-struct EmptyScene<'a> {
-    /// The scene's own log likelihood ratios, in the picture that was taken of it.
-    ratios: &'a Plane,
-    /// By how many cells it has moved since.
-    by: [isize; 2],
-    /// Columns and rows of the cells that the target hid then.
-    hidden: [Range<usize>; 2],
-}
-
-impl EmptyScene<'_> {
-    /// The scene's own ratio in a cell; 0 where the target hid it, and where it is unlike the
-    /// target.
-    fn at(&self, [column, row]: [usize; 2]) -> f32 {
-        if self.hidden[0].contains(&column) && self.hidden[1].contains(&row) {
-            return 0.0;
-        }
-        let [column, row] = [column as isize + self.by[0], row as isize + self.by[1]];
-        self.ratios.clamped(column, row).max(0.0)
-    }
-
-    /// Subtracts the scene's own ratios: the reference found this much of the target in the empty
-    /// scene already.
-    fn subtract_from(&self, ratios: &mut Plane) {
-        let last = [self.ratios.width(), self.ratios.height()].map(|side| side as isize - 1);
-        let width = ratios.width();
-        for y in 0..ratios.height() {
-            let scene = self.ratios.row((y as isize + self.by[1]).clamp(0, last[1]) as usize);
-            let hidden = if self.hidden[1].contains(&y) { self.hidden[0].clone() } else { 0..0 };
-            let row = ratios.row_mut(y);
-            for columns in [0..hidden.start, hidden.end..width] {
-                for (x, ratio) in columns.clone().zip(&mut row[columns]) {
-                    let column = (x as isize + self.by[0]).clamp(0, last[0]) as usize;
-                    *ratio -= scene[column].max(0.0);
-                }
-            }
-        }
-    }
-}
-
-/// The area in which a target is searched for.
-struct SearchArea {
-    /// Columns and rows of the coarse picture.
-    ranges: [Range<usize>; 2],
-    /// The predicted place, and the half sides of the area about it, px of the full picture.
-    predicted: [f64; 2],
-    half: [f64; 2],
-    /// Sides of the reference, px.
-    sides: [usize; 2],
-    coarseness: usize,
-}
-
-impl SearchArea {
-    /// All of a coarse picture of these sides.
-    fn whole(state: &TargetBelief, picture: [usize; 2], coarseness: usize) -> Self {
-        let working = state.appearance.working.image();
-        let position = state.position();
-        Self {
-            ranges: picture.map(|side| 0..side),
-            predicted: [position.x, position.y],
-            half: picture.map(|side| (side * coarseness) as f64 / 2.0),
-            sides: [working.width(), working.height()],
-            coarseness,
-        }
-    }
-
-    /// What is about the predicted place: the more, the longer the target has not been seen.
-    fn about(
-        state: &TargetBelief,
-        image: &Plane,
-        coarseness: usize,
-        config: &TrackerConfig,
-    ) -> Self {
-        let half = state.search_half_sides(image, config);
-        let picture = [image.width(), image.height()].map(|side| side / coarseness);
-        let whole = Self::whole(state, picture, coarseness);
-        let side = coarseness as f64;
-        let ranges = [0, 1].map(|i| {
-            let last = picture[i] - 1;
-            let first = (((whole.predicted[i] - half[i]) / side).max(0.0) as usize).min(last);
-            let end = (((whole.predicted[i] + half[i]) / side).max(0.0) as usize + 1).min(last);
-            first..end.max(first) + 1
-        });
-        Self { ranges, half, ..whole }
-    }
-
-    /// Half sides of a peak, places of the coarse picture.
-    fn near(&self) -> [usize; 2] {
-        self.sides.map(|side| ((side / self.coarseness) / 4).max(2))
-    }
-
-    fn prior(&self, state: &TargetBelief, config: &TrackerConfig) -> AreaPrior {
-        let variances = state.motion.found().map(|found| found.variance);
-        let density = 1.0 / (std::f64::consts::TAU * (variances[0] * variances[1]).sqrt());
-        let share = state.anywhere(config);
-        let area = (2.0 * self.half[0] + 1.0) * (2.0 * self.half[1] + 1.0);
-        AreaPrior {
-            predicted: self.predicted,
-            variances,
-            near: (1.0 - share) * density,
-            anywhere: share / area,
-        }
-    }
-
-    /// The likeliest place, by the log likelihood ratios in `scratch.ratios`.
-    fn best_place(&self, prior: &AreaPrior, scratch: &Scratch) -> Best {
-        let Self { ranges, .. } = self;
-        let (mut best, mut most) = ([0, 0], f64::NEG_INFINITY);
-        let most_prior = prior.most().ln();
-        for (y, row) in ranges[1].clone().enumerate() {
-            let ratios = scratch.ratios.row(y);
-            // If even the largest prior does not reach the best, the row and the logarithm are
-            // spared.
-            if f64::from(greatest(ratios)) + most_prior <= most {
-                continue;
-            }
-            for (x, column) in ranges[0].clone().enumerate() {
-                let ratio = f64::from(ratios[x]);
-                if ratio + most_prior <= most {
-                    continue;
-                }
-                let score = ratio + prior.density([self.middle(column), self.middle(row)]).ln();
-                if score > most {
-                    (best, most) = ([x, y], score);
-                }
-            }
-        }
-        let near = self.near();
-        // The next best place, away from the best, for the margin.
-        let mut rival = f32::NEG_INFINITY;
-        for y in 0..scratch.ratios.height() {
-            let row = scratch.ratios.row(y);
-            let beside = if y.abs_diff(best[1]) > near[1] {
-                greatest(row)
-            } else {
-                let before = &row[..best[0].saturating_sub(near[0])];
-                let after = &row[(best[0] + near[0] + 1).min(row.len())..];
-                greatest(before).max(greatest(after))
-            };
-            rival = rival.max(beside);
-        }
-        let (column, row) = (ranges[0].start + best[0], ranges[1].start + best[1]);
-        Best { cell: [column, row], margin: scratch.ratios.row(best[1])[best[0]] - rival }
-    }
-
-    /// What the scene itself had at the places of a coarse picture with these sides, given how it
-    /// has turned by now; `None` if nothing is known of it.
-    fn empty_scene<'a>(
-        &self,
-        picture: [usize; 2],
-        turned: [f64; 2],
-        state: &TargetBelief,
-        memory: &'a SearchMemory,
-    ) -> Option<EmptyScene<'a>> {
-        let (background, seen) = (memory.background.as_ref()?, state.in_snapshot?);
-        let shift = [0, 1].map(|i| turned[i] - background.turned[i]);
-        let hidden = [0, 1].map(|i| {
-            let (reach, seen) = (self.sides[i] as f64, [seen.x, seen.y][i]);
-            let off = |index: usize| self.middle(index) + shift[i] - seen;
-            let first = (0..picture[i]).find(|index| off(*index) >= -reach);
-            let first = first.unwrap_or(picture[i]);
-            let end = (first..picture[i]).find(|index| off(*index) > reach);
-            first..end.unwrap_or(picture[i])
-        });
-        let by = shift.map(|shift| (shift / self.coarseness as f64).round() as isize);
-        Some(EmptyScene { ratios: &background.ratios, by, hidden })
-    }
-
-    /// The middle of a cell of the coarse picture, px of the full picture.
-    fn place_of(&self, cell: [usize; 2]) -> [f64; 2] {
-        cell.map(|index| self.middle(index))
-    }
-
-    /// The middle of a column or row of the coarse picture, px of the full picture.
-    fn middle(&self, index: usize) -> f64 {
-        let side = self.coarseness as f64;
-        index as f64 * side + (side - 1.0) / 2.0
     }
 }
