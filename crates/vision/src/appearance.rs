@@ -159,7 +159,7 @@ fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
 }
 
 /// Share of white noise's variance that is left when an image is sampled between its pixels.
-fn noise_kept(place: ImagePoint) -> f32 {
+pub(crate) fn noise_kept(place: ImagePoint) -> f32 {
     let axis = |at: f64| {
         let f = at - at.floor();
         // The squared weights of linear interpolation; the cubic one keeps about a third more.

@@ -3,57 +3,73 @@
 //! A box in which nothing stands out cannot be put right by its image ([`crate::figure`]), and as
 //! long as the reference is noisy the places at which it learns wander away from the target's
 //! middle. The mean of many images has a fraction of their noise, and the scene behind a moving
-//! target averages out of it. So, until the first appearance is clear of noise, the figure is looked
-//! for in that mean; where it stands beside the middle of the reference, the reference is cut out
-//! anew about it.
+//! target averages out of it. (Behind one that hovers it does not: two things stand out then, and the
+//! reference stays.) So, until the first appearance is clear of noise, the figure is looked for in
+//! that mean; where it stands beside the middle of the reference, the reference is cut out anew
+//! about it.
 
 use crossfix_correlation::{Plane, Resampler, View};
 
-use crate::appearance::Appearance;
+use crate::appearance::{Appearance, noise_kept};
 use crate::crop::replace_invalid;
-use crate::figure::{farthest, meant};
+use crate::figure::{SIDES, farthest, is_centred, meant};
 use crate::scratch::Scratch;
 use crate::state::TargetBelief;
-use crate::{ImagePoint, PixelBox, TrackerConfig};
+use crate::{ImagePoint, PixelBox, ReferenceStrategy, TrackerConfig};
 
-/// Number of images in the mean when the figure is first looked for. It is looked for again each
-/// time that the number has doubled: the noise falls by 3 dB, and a mean of n images wanders by
-/// shares of 1/n. Reasoned: with half of it there is one look more.
+/// Least number of images in the mean for the figure to be looked for; it is looked for again each
+/// time that the number has doubled. Reasoned: with half of it there is one look more, and the first
+/// is at 3 dB more noise.
 const FIRST_LOOK: f32 = 4.0;
+/// Variances of the log scale and of the turn of a reference that has just been cut out.
+const IN_SHAPE: [f64; 2] = [1e-6; 2];
 
 /// The mean of what is about a target in its images.
 #[derive(Clone, Debug)]
 pub(crate) struct Surroundings {
     mean: Plane,
+    /// Variance of its noise.
+    noise: f32,
     /// Number of images in it, each weighted by the certainty that it shows the target.
     images: f32,
     next_look: f32,
 }
 
 impl Surroundings {
-    fn new(box_sides: [f64; 2], box_sd_px: f64) -> Self {
-        let [width, height] =
-            box_sides.map(|side| 2 * (side / 2.0 + farthest(box_sd_px)).ceil() as usize + 1);
-        Self { mean: Plane::from_fn(width, height, |_, _| 0.0), images: 0.0, next_look: FIRST_LOOK }
+    /// For a box of these sides; `None` where no figure is looked for in as large a window.
+    fn new(box_sides: [f64; 2], config: &TrackerConfig) -> Option<Self> {
+        let beyond = farthest(config.box_sd_px) + config.margin_px;
+        let [width, height] = box_sides.map(|side| 2 * (side / 2.0 + beyond).ceil() as usize + 1);
+        let is_searched = [width, height].iter().all(|side| SIDES.contains(side));
+        is_searched.then(|| Self {
+            mean: Plane::from_fn(width, height, |_, _| 0.0),
+            noise: 0.0,
+            images: 0.0,
+            next_look: FIRST_LOOK,
+        })
     }
 
-    /// Takes in an image that shows the target at a place with probability `certainty`.
+    /// Takes in an image with this variance of its noise, which shows the target at a place with
+    /// probability `certainty`.
     fn take_in(
         &mut self,
-        image: &Plane,
+        image: (&Plane, f32),
         (place, certainty): (ImagePoint, f32),
         resampler: &mut Resampler,
         view: &mut Plane,
     ) {
+        let (image, noise) = image;
         view.reshape(self.mean.width(), self.mean.height());
         resampler.resample(image, View { x: place.x, y: place.y, scale: 1.0, turn_rad: 0.0 }, view);
         replace_invalid(view);
         self.images += certainty;
-        // Weighted running mean.
+        // Weighted running mean; its noise is (1 - s)^2 v + s^2 v_new.
         let share = certainty / self.images;
         for (mean, new) in self.mean.samples_mut().iter_mut().zip(view.samples()) {
             *mean += share * (new - *mean);
         }
+        let new = noise * noise_kept(place);
+        self.noise = (1.0 - share).powi(2) * self.noise + share.powi(2) * new;
     }
 
     /// The middle of the mean, which is that of the reference.
@@ -62,12 +78,17 @@ impl Surroundings {
         ImagePoint { x: of(self.mean.width()), y: of(self.mean.height()) }
     }
 
-    /// The middle of the target's box by the mean, where something stands out there: that of the
-    /// figure, or of the reference where that fits the figure.
-    fn figure(&self, box_sides: [f64; 2], noise: f32, box_sd_px: f64) -> Option<ImagePoint> {
-        let about = PixelBox::about(self.middle(), box_sides[0], box_sides[1]);
-        let noise_sd = (noise / self.images).sqrt();
-        meant(&self.mean, about, box_sd_px, noise_sd).map(|meant| meant.centre())
+    /// The figure's box, where one thing stands out in the mean.
+    fn figure(&self, about: PixelBox, config: &TrackerConfig) -> Option<PixelBox> {
+        meant(&self.mean, about, config.box_sd_px, self.noise.sqrt())
+    }
+
+    /// Whether a reference of a box lies within the mean.
+    fn holds(&self, about: PixelBox, margin_px: f64) -> bool {
+        let (middle, centre) = (self.middle(), about.centre());
+        let within = |off: f64, side: f64, reach: f64| off.abs() + side / 2.0 + margin_px <= reach;
+        within(centre.x - middle.x, about.width, middle.x)
+            && within(centre.y - middle.y, about.height, middle.y)
     }
 }
 
@@ -75,9 +96,9 @@ impl TargetBelief {
     /// Begins to look for the target's figure in the mean of its images, if the first one alone
     /// does not show the target clearly.
     pub(crate) fn begin_centring(&mut self, config: &TrackerConfig) {
-        if config.box_sd_px > 0.0 && self.appearance.is_anchor_noisy() {
-            let surroundings = Surroundings::new(self.appearance.sides(), config.box_sd_px);
-            self.surroundings = Some(Box::new(surroundings));
+        let may_change = config.box_sd_px > 0.0 && config.reference != ReferenceStrategy::Fixed;
+        if may_change && self.appearance.is_anchor_noisy() {
+            self.surroundings = Surroundings::new(self.appearance.sides(), config).map(Box::new);
         }
     }
 
@@ -99,17 +120,22 @@ impl TargetBelief {
         config: &TrackerConfig,
     ) -> bool {
         let Some(mut surroundings) = self.surroundings.take() else { return false };
-        let resampler = &mut scratch.buffers.resampler;
-        surroundings.take_in(image, (place, certainty), resampler, &mut scratch.gate);
+        let Scratch { buffers, gate, .. } = scratch;
+        let image = (image, self.noise);
+        surroundings.take_in(image, (place, certainty), &mut buffers.resampler, gate);
         let is_last = !self.appearance.is_anchor_noisy();
+        let is_time = is_last || surroundings.images >= surroundings.next_look;
         let mut has_moved = false;
-        if is_last || surroundings.images >= surroundings.next_look {
+        if is_time && surroundings.images >= FIRST_LOOK {
             surroundings.next_look *= 2.0;
-            let sides = self.appearance.sides();
-            if let Some(figure) = surroundings.figure(sides, self.noise, config.box_sd_px) {
-                has_moved = figure != surroundings.middle();
+            let [width, height] = self.appearance.sides();
+            let about = PixelBox::about(surroundings.middle(), width, height);
+            if let Some(figure) = surroundings.figure(about, config) {
+                let anew = PixelBox::about(figure.centre(), width, height);
+                has_moved =
+                    !is_centred(about, figure) && surroundings.holds(anew, config.margin_px);
                 if has_moved {
-                    self.cut_out_about(figure, &surroundings, scratch, config);
+                    self.cut_out(anew, &surroundings, scratch, config);
                 }
                 // The next look is at new images.
                 surroundings.images = 0.0;
@@ -119,25 +145,25 @@ impl TargetBelief {
         has_moved
     }
 
-    /// Cuts the reference out of the mean anew, about the figure's middle.
-    fn cut_out_about(
+    /// Cuts the reference out of the mean anew, in a box there.
+    fn cut_out(
         &mut self,
-        figure: ImagePoint,
+        about: PixelBox,
         surroundings: &Surroundings,
         scratch: &mut Scratch,
         config: &TrackerConfig,
     ) {
-        let [width, height] = self.appearance.sides();
-        let about = PixelBox::about(figure, width, height);
-        let Surroundings { mean, images, .. } = surroundings;
-        let noise = self.noise / images;
+        let (middle, figure) = (surroundings.middle(), about.centre());
+        let Surroundings { mean, noise, images, .. } = surroundings;
+        // The mean's noise is smooth already: sampling between its pixels hardly takes from it.
+        let noise = noise / noise_kept(figure);
         let appearance = Appearance::new(mean, about, noise, config, &mut scratch.buffers);
         self.appearance = appearance.of_images(*images);
-        let middle = surroundings.middle();
         let by = [figure.x - middle.x, figure.y - middle.y];
         self.motion.move_by(by);
         self.last_seen = ImagePoint { x: self.last_seen.x + by[0], y: self.last_seen.y + by[1] };
-        // The contrast is in units of the reference's own.
+        // The contrast is in units of the reference's own, which has the target's size and direction.
         (self.contrast, self.usual_contrast, self.contrast_variance) = (1.0, 1.0, 0.0);
+        self.shape_variances = IN_SHAPE;
     }
 }

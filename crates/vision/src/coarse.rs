@@ -16,7 +16,7 @@ use crate::state::TargetBelief;
 /// looks like the target from afar. And the most pixels per side that are averaged into one.
 const COARSE_SIDE: usize = 5;
 const MOST_COARSE: usize = 4;
-/// Number of places by which the scene's contrasts are known: their median to a hundredth. With half of
+/// Number of places by which the scene's contrasts are known: their median to a few hundredths. With half of
 /// it a search is not noticeably quicker.
 const ENOUGH_PLACES: usize = 10_000;
 /// Least standard deviation of the scene's contrasts: the steps of the samples make every scene
@@ -120,7 +120,8 @@ impl CoarseReference {
         contrasts.clear();
         // z = cov / var is the contrast at a placement; its standard deviation about zero follows
         // from the median of |z|, which the few placements on the target do not change.
-        let step = covariances.len().div_ceil(ENOUGH_PLACES).max(1);
+        // An odd step, so that it is not the same columns of every row.
+        let step = covariances.len().div_ceil(ENOUGH_PLACES) | 1;
         contrasts.extend(covariances.iter().step_by(step).map(|covariance| covariance.abs()));
         let deviation =
             OF_MEDIAN * median(contrasts) / self.reference.variance().max(f32::MIN_POSITIVE);

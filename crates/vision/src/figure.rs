@@ -29,7 +29,7 @@ const FURTHEST: f64 = 2.5;
 const WINDOWS: u32 = 4;
 /// Least and greatest side of such a window, px: a figure has room in the least, and a target of 50
 /// px in a box twice as large in the greatest; a window twice as wide takes a second.
-const SIDES: RangeInclusive<usize> = 5..=129;
+pub(crate) const SIDES: RangeInclusive<usize> = 5..=129;
 /// Ground about a figure that the widest window has in addition, px.
 const GROUND_PX: f64 = 2.0;
 /// A figure is taken for the target if its top is at least this many standard deviations of the
@@ -236,13 +236,18 @@ pub(crate) fn meant(
 
 /// Whether a box fits its figure well enough to be kept.
 fn fits(given: PixelBox, figure: PixelBox) -> bool {
+    let sides = [(given.width, figure.width), (given.height, figure.height)];
+    let is_filled = sides
+        .iter()
+        .all(|(side, filled)| *filled >= LEAST_FILLED * side && *side >= LEAST_FILLED * filled);
+    is_filled && is_centred(given, figure)
+}
+
+/// Whether the middle of a box is that of its figure, as well as figures are known.
+pub(crate) fn is_centred(given: PixelBox, figure: PixelBox) -> bool {
     let (at, is) = (given.centre(), figure.centre());
-    let sides =
-        [(given.width, figure.width, is.x - at.x), (given.height, figure.height, is.y - at.y)];
-    sides.iter().all(|(side, filled, off)| {
-        let is_filled = *filled >= LEAST_FILLED * side && *side >= LEAST_FILLED * filled;
-        is_filled && off.abs() <= MOST_OFF * side + 1.0
-    })
+    let sides = [(given.width, is.x - at.x), (given.height, is.y - at.y)];
+    sides.iter().all(|(side, off)| off.abs() <= MOST_OFF * side + 1.0)
 }
 
 /// The box of the one thing that stands out in a window that is wider than the given box by

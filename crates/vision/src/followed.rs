@@ -47,12 +47,24 @@ impl Follower {
     ) -> Self {
         match config.algorithm {
             Algorithm::Posterior => {
-                let mut target = Box::new(Target::new(image, place, scratch, config));
-                target.state.begin_centring(config);
-                Self::Posterior(target)
+                Self::Posterior(Box::new(Target::new(image, place, scratch, config)))
             }
             Algorithm::Paper => Self::Paper(Box::new(PaperTarget::new(image, place, config))),
         }
+    }
+
+    /// The same for a box that somebody has given.
+    pub(crate) fn given(
+        image: &Plane,
+        place: PixelBox,
+        scratch: &mut Scratch,
+        config: &TrackerConfig,
+    ) -> Self {
+        let mut follower = Self::new(image, place, scratch, config);
+        if let Self::Posterior(target) = &mut follower {
+            target.state.begin_centring(config);
+        }
+        follower
     }
 
     pub(crate) fn step(

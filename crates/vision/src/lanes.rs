@@ -153,11 +153,24 @@ impl Mul<f32> for Lanes {
 mod tests {
     use proptest::prelude::*;
 
+    use super::{greatest, sum};
+
     proptest! {
         #[test]
         fn they_are_the_exponential_and_the_logarithm(x in -80.0f32..80.0, y in 1e-30f32..1e30) {
             prop_assert!((super::exp(x) / x.exp() - 1.0).abs() < 1e-5);
             prop_assert!((super::ln(y) - y.ln()).abs() < 1e-6 * (1.0 + y.ln().abs()));
         }
+    }
+
+    #[test]
+    fn the_greatest_and_the_sum_of_numbers_of_any_count() {
+        for count in 0..40 {
+            let values: Vec<f32> = (0..count).map(|k| ((k * 7) % 11) as f32 - 20.0).collect();
+            let largest = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            assert_eq!(greatest(&values), largest);
+            assert_eq!(sum(&values), values.iter().sum::<f32>());
+        }
+        assert_eq!(greatest(&[f32::NAN, -3.0, f32::NAN]), -3.0);
     }
 }

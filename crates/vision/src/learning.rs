@@ -30,7 +30,8 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
 
 impl TargetBelief {
     /// Learns contrast, size, direction and appearance from an image, the more the surer the target
-    /// was seen. Returns whether the reference has another middle now.
+    /// was seen. Returns the probability with which the image was taken for the target's, 0 if nothing was
+    /// learnt.
     pub(crate) fn learn(
         &mut self,
         frame: FrameInput<'_>,
@@ -38,10 +39,10 @@ impl TargetBelief {
         fit: TargetFit,
         certainty: f64,
         scratch: &mut Scratch,
-    ) -> bool {
-        let FrameInput { image, interval, config, .. } = frame;
+    ) -> f32 {
+        let FrameInput { image, interval, .. } = frame;
         if certainty < LEAST_CERTAINTY[0] {
-            return false;
+            return 0.0;
         }
         let seen = certainty > SEEN;
         if seen {
@@ -62,7 +63,7 @@ impl TargetBelief {
         }
         let certainty = certainty * ramp(fit.score, LEARNING_SCORES);
         if certainty < LEAST_CERTAINTY[1] {
-            return false;
+            return 0.0;
         }
         // Size and direction take effect only with the learning; without it they would run
         // away.
@@ -73,7 +74,7 @@ impl TargetBelief {
         let share = self.appearance.learn(image, place, self.noise, certainty, interval, buffers);
         let variances = [fit.covariance.m11, fit.covariance.m22];
         self.motion.learn(place, f64::from(share), Some(variances));
-        self.centre(image, (place, certainty), scratch, config)
+        certainty
     }
 
     fn follow_shape(&mut self, fit: TargetFit) {

@@ -85,7 +85,8 @@ impl Sought<'_> {
             whole_ratios(self.state, frame.image, &coarse, frame.config, scratch);
         let area = SearchArea::whole(self.state, sides, coarse.coarseness);
         let turned = frame.scene.turned();
-        if let Some(scene) = area.empty_scene(sides, turned, self.state, self.memory) {
+        let seen = self.state.in_snapshot;
+        if let Some(scene) = seen.and_then(|at| area.empty_scene(sides, turned, at, self.memory)) {
             scene.subtract_from(&mut scratch.ratios);
         }
         let near = area.near();
@@ -96,7 +97,7 @@ impl Sought<'_> {
         let is_sure = likeliest.probability >= SURE_PLACE;
         if !is_sure {
             let best = area.best_place(&area.prior(self.state, frame.config), scratch);
-            let scene = area.empty_scene(sides, turned, self.state, self.memory);
+            let scene = seen.and_then(|at| area.empty_scene(sides, turned, at, self.memory));
             let background = scene.map_or(0.0, |scene| scene.at(best.cell));
             return self.clear_find(frame, searched, (&area, best, background), scratch);
         }

@@ -5,11 +5,11 @@ use std::ops::Range;
 
 use crossfix_correlation::Plane;
 
-use crate::TrackerConfig;
 use crate::lanes::greatest;
 use crate::scratch::Scratch;
 use crate::search_memory::SearchMemory;
 use crate::state::TargetBelief;
+use crate::{ImagePoint, TrackerConfig};
 
 /// The best placement on the coarse picture.
 pub(crate) struct Best {
@@ -58,7 +58,7 @@ impl EmptyScene<'_> {
         if self.hidden[0].contains(&column) && self.hidden[1].contains(&row) {
             return 0.0;
         }
-        let [column, row] = [column as isize + self.by[0], row as isize + self.by[1]];
+        let [column, row] = [0, 1].map(|i| ([column, row][i] as isize).saturating_add(self.by[i]));
         self.ratios.clamped(column, row).max(0.0)
     }
 
@@ -68,12 +68,13 @@ impl EmptyScene<'_> {
         let last = [self.ratios.width(), self.ratios.height()].map(|side| side as isize - 1);
         let width = ratios.width();
         for y in 0..ratios.height() {
-            let scene = self.ratios.row((y as isize + self.by[1]).clamp(0, last[1]) as usize);
+            let scene =
+                self.ratios.row((y as isize).saturating_add(self.by[1]).clamp(0, last[1]) as usize);
             let hidden = if self.hidden[1].contains(&y) { self.hidden[0].clone() } else { 0..0 };
             let row = ratios.row_mut(y);
             for columns in [0..hidden.start, hidden.end..width] {
                 for (x, ratio) in columns.clone().zip(&mut row[columns]) {
-                    let column = (x as isize + self.by[0]).clamp(0, last[0]) as usize;
+                    let column = (x as isize).saturating_add(self.by[0]).clamp(0, last[0]) as usize;
                     *ratio -= scene[column].max(0.0);
                 }
             }
@@ -187,15 +188,16 @@ impl SearchArea {
     }
 
     /// What the scene itself had at the places of a coarse picture with these sides, given how it
-    /// has turned by now; `None` if nothing is known of it.
+    /// has turned by now, and where the target was `seen` in the picture that was taken of it;
+    /// `None` if nothing is known of it.
     pub(crate) fn empty_scene<'a>(
         &self,
         picture: [usize; 2],
         turned: [f64; 2],
-        state: &TargetBelief,
+        seen: ImagePoint,
         memory: &'a SearchMemory,
     ) -> Option<EmptyScene<'a>> {
-        let (background, seen) = (memory.background.as_ref()?, state.in_snapshot?);
+        let background = memory.background.as_ref()?;
         let shift = [0, 1].map(|i| turned[i] - background.turned[i]);
         let hidden = [0, 1].map(|i| {
             let (reach, seen) = (self.sides[i] as f64, [seen.x, seen.y][i]);
@@ -224,6 +226,7 @@ impl SearchArea {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::search_memory::Background;
 
     #[test]
     fn the_empty_scene_is_subtracted_where_it_has_moved_to_and_not_where_the_target_hid_it() {
@@ -240,5 +243,32 @@ mod tests {
         assert_eq!(empty.at([1, 3]), 11.0);
         assert_eq!(empty.at([2, 2]), 0.0, "the target hid it");
         assert_eq!(empty.at([6, 0]), 0.0, "unlike the target: 6 - 12");
+    }
+
+    /// A cell is where the scene had its middle then, by the turns of the scene.
+    #[test]
+    fn the_empty_scene_moves_as_the_camera_turns_and_hides_what_the_target_hid() {
+        let area = SearchArea {
+            ranges: [0..20, 0..15],
+            predicted: [20.0, 15.0],
+            half: [20.0, 15.0],
+            sides: [5, 3],
+            coarseness: 2,
+        };
+        let ratios = Plane::from_fn(20, 15, |x, y| 1.0 + (x + 100 * y) as f32);
+        let background = Background { coarseness: 2, ratios, turned: [1.0, 2.0] };
+        let mut memory = SearchMemory::default();
+        memory.background = Some(background);
+        let seen = ImagePoint { x: 16.0, y: 14.0 };
+        let (turned, sides) = ([7.3, -1.6], [20, 15]);
+        let empty = area.empty_scene(sides, turned, seen, &memory).unwrap();
+        for (row, column) in (0..15).flat_map(|row| (0..20).map(move |column| (row, column))) {
+            let then = [area.middle(column) + 6.3, area.middle(row) - 3.6];
+            let hidden = (then[0] - seen.x).abs() <= 5.0 && (then[1] - seen.y).abs() <= 3.0;
+            let [x, y] = then.map(|then| ((then + 0.5) / 2.0 - 0.5).round());
+            let was = 1.0 + (x.clamp(0.0, 19.0) + 100.0 * y.clamp(0.0, 14.0)) as f32;
+            let expected = if hidden { 0.0 } else { was };
+            assert_eq!(empty.at([column, row]), expected, "column {column}, row {row}");
+        }
     }
 }

@@ -11,8 +11,8 @@ use crate::search::LEAST_RATIO;
 /// as bright as the sky behind it. With half of it a panning camera's target is right in 96.5 % of
 /// the frames instead of 97.5, and longer taken for something else.
 const SIZES: f64 = 2.5;
-/// Least share of the reference's energy that is the target's: one that is noise for the most part finds
-/// itself in anything, and what moves there is then not followed as what it is. From 0.6 to 0.9 the same
+/// Least share of the reference's energy that is the target's: one with much noise in it finds itself in
+/// anything, and what moves there is then not followed as what it is. From 0.6 to 0.9 the same
 /// is found; with half of it one sequence of 228, whose target no image shows at first, is lost for good.
 const LEAST_CLEAR: f32 = 0.7;
 /// How far its middle may be off, in the larger sides.
@@ -36,8 +36,7 @@ impl Target {
         found: PixelBox,
         scratch: &mut Scratch,
     ) -> Option<SightingOfLost> {
-        let is_clear = self.state.appearance.clear_share() > LEAST_CLEAR;
-        if !self.state.is_searching() || !is_clear || !self.may_be(frame, found) {
+        if !self.state.is_searching() || !self.may_be(frame, found) {
             return None;
         }
         let last = self.seen_as_it_looks(frame, found, scratch);
@@ -84,7 +83,8 @@ impl Target {
             frame.config,
         );
         let fit = self.state.fit_at(peak.column, peak.row, peak.origin, scratch, frame.config);
-        let has_come = peak.log_ratio > LEAST_RATIO
+        let has_come = self.state.appearance.clear_share() > LEAST_CLEAR
+            && peak.log_ratio > LEAST_RATIO
             && self.identity.arrival_log_ratio(&self.state, frame, fit.place, scratch) >= 0.0;
         has_come.then_some(SightingOfLost { fit, log_ratio: peak.log_ratio, as_at_first: false })
     }
@@ -101,6 +101,7 @@ impl Target {
             self.search_memory.take_first(&mut self.state, frame.config, &mut scratch.buffers);
         }
         self.hypotheses.clear();
+        self.state.forget_surroundings();
         self.identity.begin_probation(&self.state, frame.scene);
         self.state.motion.restart(fit.found(), frame.config.search_velocity_sd_px);
         self.seen(fit.place);

@@ -49,7 +49,7 @@ pub(crate) struct TargetBelief {
     pub(crate) last_seen: ImagePoint,
     /// Whether it has not been seen yet but where it was given.
     pub(crate) is_new: bool,
-    /// What is about it, as long as nothing has stood out in its place.
+    /// The mean of what is about it, as long as its first appearance is not clear of noise.
     pub(crate) surroundings: Option<Box<Surroundings>>,
     /// Its place in the tracker's snapshot picture.
     pub(crate) in_snapshot: Option<ImagePoint>,

@@ -187,7 +187,7 @@ impl ImageTracker {
     }
 
     /// Follows all targets into the next image and returns its tracks, ordered by id. An image
-    /// without new, lost, doubtful or given-up targets, and none at its border, allocates no
+    /// without new, lost, doubtful, noisy or given-up targets, and none at its border, allocates no
     /// memory, but for the detector.
     pub fn step(&mut self, image: &Plane, time: Timestamp) -> &[ImageTrack] {
         let shot = Shot { time, size: (image.width(), image.height()) };

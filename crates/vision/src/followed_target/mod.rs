@@ -71,7 +71,7 @@ fn without_prior(posterior: AxisMeasurement, prior: AxisMeasurement) -> AxisMeas
 /// Half sides of a gate, made smaller until it has no more than [`MOST_IN_DOUBT`] placements.
 fn narrowed(half: [usize; 2]) -> [usize; 2] {
     let share = MOST_IN_DOUBT as f64 / (half[0] * half[1]).max(1) as f64;
-    half.map(|side| if share < 1.0 { (side as f64 * share.sqrt()) as usize } else { side })
+    half.map(|side| if share < 1.0 { ((side as f64 * share.sqrt()) as usize).max(1) } else { side })
 }
 
 impl Target {
@@ -149,6 +149,7 @@ impl Target {
             self.state.motion.take_place(given);
         }
         self.identity.set_given();
+        self.state.surroundings = None;
         let share = self.state.appearance.learn(
             image,
             place,
@@ -172,13 +173,15 @@ impl Target {
 
     fn follow(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> TargetStep {
         let FrameInput { image, config, .. } = frame;
-        // The gate must hold every hypothesis, but is widened to three times its size at most.
+        // The gate holds every hypothesis, but is widened to three times its size at most, and
+        // not beyond what may be looked at.
         let reach = self.hypotheses.reach(self.state.position());
         let half = self.state.half_gate(image, config);
         let image_sides = [image.width(), image.height()];
         let half = [0, 1]
             .map(|i| (half[i] + (reach[i].ceil() as usize).min(2 * half[i])).min(image_sides[i]));
-        let half = if self.is_in_doubt() { narrowed(half) } else { half };
+        let is_own_rule = matches!(config.gate, GateRule::Innovation { .. });
+        let half = if is_own_rule && self.is_in_doubt() { narrowed(half) } else { half };
         let whole = Region::about(&self.state, half);
         let noise = scratch.meter.variance_within(
             image,
@@ -318,10 +321,17 @@ impl Target {
         certainty: f64,
         scratch: &mut Scratch,
     ) {
-        let may_learn = !self.identity.is_on_probation();
-        if may_learn && self.state.learn(frame, place, fit, certainty, scratch) {
-            // The other places are those of the reference as it was cut out before.
-            self.hypotheses.clear();
+        if self.identity.is_on_probation() {
+            return;
+        }
+        let share = self.state.learn(frame, place, fit, certainty, scratch);
+        // Several places are those of one reference: while there are, it stays as it is.
+        let FrameInput { image, config, .. } = frame;
+        if share > 0.0
+            && self.hypotheses.is_empty()
+            && self.state.centre(image, (place, share), scratch, config)
+        {
+            self.search_memory.forget_other();
         }
     }
 }
