@@ -21,6 +21,10 @@ use crate::{ImagePoint, PixelBox, ReferenceStrategy, TrackerConfig};
 /// time that the number has doubled. Reasoned: with half of it there is one look more, and the first
 /// is at 3 dB more noise.
 const FIRST_LOOK: f32 = 4.0;
+/// Standard deviation of a figure's middle about the target's own, px: half of what a box may lie beside
+/// its figure without being moved. With half of it the covariance of a target that has just been centred
+/// promises too much.
+const FIGURE_SD_PX: f64 = 0.5;
 /// Variances of the log scale and of the turn of a reference that has just been cut out.
 const IN_SHAPE: [f64; 2] = [1e-6; 2];
 
@@ -160,7 +164,7 @@ impl TargetBelief {
         let appearance = Appearance::new(mean, about, noise, config, &mut scratch.buffers);
         self.appearance = appearance.of_images(*images);
         let by = [figure.x - middle.x, figure.y - middle.y];
-        self.motion.move_by(by);
+        self.motion.recentre(by, FIGURE_SD_PX.powi(2));
         self.last_seen = ImagePoint { x: self.last_seen.x + by[0], y: self.last_seen.y + by[1] };
         // The contrast is in units of the reference's own, which has the target's size and direction.
         (self.contrast, self.usual_contrast, self.contrast_variance) = (1.0, 1.0, 0.0);

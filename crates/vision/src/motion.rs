@@ -11,8 +11,12 @@
 //! target, weighted by how well each has predicted (interacting multiple models, Solonar 2023, eqs.
 //! 10-17; there of a pixel's brightness).
 
+mod axis;
+
 use crossfix_filter::{AxisMeasurement, normal_score};
-use nalgebra::{Matrix2, Matrix3, RowVector3, Vector3};
+use nalgebra::{Matrix2, Matrix3, Vector3};
+
+use self::axis::{AxisMotion, OFFSET, POSITION, VELOCITY};
 
 use crate::ImagePoint;
 
@@ -49,20 +53,6 @@ const OUTLIER: f64 = 9.21;
 /// The matched noise variance is at most this many times larger or smaller than the expected one: a
 /// factor of a hundred in the standard deviation, from a hundredth of a pixel to a pixel.
 const MOST_MATCHED: f64 = 1e4;
-
-/// Indices of the states of an axis.
-const POSITION: usize = 0;
-const VELOCITY: usize = 1;
-const OFFSET: usize = 2;
-/// Measurement matrix H: the reference is found at position plus offset.
-const FOUND_AT: RowVector3<f64> = RowVector3::new(1.0, 0.0, 1.0);
-
-/// Position, velocity and offset on one axis.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct AxisMotion {
-    mean: Vector3<f64>,
-    covariance: Matrix3<f64>,
-}
 
 /// Interacting multiple model filter of a target's motion in the image.
 #[derive(Clone, Debug)]
@@ -107,56 +97,6 @@ impl PlaceEvidence {
     /// Evidence of a measurement that is not doubted.
     pub(crate) fn of(at: [AxisMeasurement; 2]) -> Self {
         Self { near: 1.0, at, elsewhere: 0.0, elsewhere_at: at }
-    }
-}
-
-impl AxisMotion {
-    fn found(&self) -> AxisMeasurement {
-        let position = self.mean[POSITION] + self.mean[OFFSET];
-        AxisMeasurement {
-            position,
-            variance: (FOUND_AT * self.covariance * FOUND_AT.transpose()).x,
-        }
-    }
-
-    /// Mean and covariance of the mixture of this state, with weight `share`, and another.
-    fn mixed(&self, share: f64, other: &Self) -> Self {
-        let rest = 1.0 - share;
-        // P = s P1 + (1 - s) P2 + s (1 - s) d d', d the difference of the means.
-        let apart = self.mean - other.mean;
-        let covariance = self.covariance * share
-            + other.covariance * rest
-            + apart * apart.transpose() * (share * rest);
-        Self { mean: self.mean * share + other.mean * rest, covariance }
-    }
-
-    /// Predicts with constant velocity and white acceleration, given by its variance, that is
-    /// constant over the interval (Herasymenko 2021, eqs. 8 and 10; erratum: its variance).
-    fn predict(&mut self, interval: f64, acceleration: f64) {
-        self.mean[POSITION] += interval * self.mean[VELOCITY];
-        // P = F P F' + G G' sigma_a^2, G = [T^2/2, T, 0]'; F adds T times the velocity.
-        let p = &mut self.covariance;
-        let along = p.column(VELOCITY) * interval;
-        p.set_column(POSITION, &(p.column(POSITION) + along));
-        let across = p.row(VELOCITY) * interval;
-        p.set_row(POSITION, &(p.row(POSITION) + across));
-        let driven = Vector3::new(interval * interval / 2.0, interval, 0.0);
-        *p += driven * driven.transpose() * acceleration;
-    }
-
-    /// Regression of the states on where the reference is found: `P H' / (H P H')`.
-    fn slope(&self) -> Vector3<f64> {
-        let with_found = self.covariance * FOUND_AT.transpose();
-        with_found / (FOUND_AT * with_found).x.max(f64::MIN_POSITIVE)
-    }
-
-    /// Sets mean and variance of where the reference is found; the states follow by regression.
-    fn condition(&mut self, found: AxisMeasurement) {
-        let (slope, before) = (self.slope(), self.found());
-        // x += b (z - z0), P += b b' (v - v0), with b the slope and z0, v0 the values so far.
-        self.mean += slope * (found.position - before.position);
-        self.covariance += slope * slope.transpose() * (found.variance - before.variance);
-        self.covariance = (self.covariance + self.covariance.transpose()) / 2.0;
     }
 }
 
@@ -508,6 +448,18 @@ impl ImageMotion {
         let wider = Matrix3::from_diagonal(&Vector3::new(root, root, 1.0));
         for axis in self.ways.iter_mut().flatten() {
             axis.covariance = wider * axis.covariance * wider;
+        }
+        self.combine();
+    }
+
+    /// Takes the reference for one that was cut out anew, `by` px beside its middle before: of the
+    /// target itself, whose place is then known to `variance`, px^2. That error is in the position
+    /// and with the opposite sign in the offset, as at first.
+    pub(crate) fn recentre(&mut self, by: [f64; 2], variance: f64) {
+        self.move_by(by);
+        let off = Vector3::new(1.0, 0.0, -1.0);
+        for axis in self.ways.iter_mut().flatten() {
+            axis.covariance += off * off.transpose() * variance;
         }
         self.combine();
     }

@@ -335,3 +335,16 @@ impl Target {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gate_is_made_smaller_in_its_shape_and_only_where_it_is_too_large() {
+        assert_eq!(narrowed([60, 90]), [60, 90]);
+        assert_eq!(narrowed([400, 200]), [200, 100]);
+        assert_eq!(narrowed([10_000_000, 1]), [447_213, 1]);
+        assert_eq!(narrowed([0, 5]), [0, 5]);
+    }
+}
