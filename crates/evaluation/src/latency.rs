@@ -34,7 +34,8 @@ impl LatencyRecorder {
         self.tracks.push(((camera.to_owned(), sequence), arrival));
     }
 
-    /// The latency, if there is any pair.
+    /// The latency, if there is any pair, and half of the tracks come after what they followed
+    /// from: nothing comes before its cause, so the times of an import are not those of an arrival.
     pub fn latency(&self) -> Option<Latency> {
         let pairs = self.tracks.iter().filter_map(|(key, arrival)| {
             Some(arrival.seconds_since(self.cause(key, *arrival)?) * 1e3)
@@ -43,8 +44,10 @@ impl LatencyRecorder {
         milliseconds.sort_by(f64::total_cmp);
         let last = milliseconds.len().checked_sub(1)?;
         let quantile = |q: f64| milliseconds[(q * last as f64).round() as usize];
-        Some(Latency { p50_ms: quantile(0.5), p99_ms: quantile(0.99) })
+        let latency = Latency { p50_ms: quantile(0.5), p99_ms: quantile(0.99) };
+        (latency.p50_ms >= 0.0).then_some(latency)
     }
+
     /// Arrival of the frame that caused tracks which arrived at a time: the last arrival before
     /// that time, or the first where the tracks overtook the frame.
     fn cause(&self, key: &(String, u64), tracks: Timestamp) -> Option<Timestamp> {
@@ -61,6 +64,19 @@ impl LatencyRecorder {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn tracks_that_come_before_what_they_followed_from_have_no_latency() {
+        for (late_s, is_known) in [(0.02, true), (-0.004, false)] {
+            let mut recorder = LatencyRecorder::default();
+            for sequence in 0..10 {
+                let arrival = Timestamp::from_seconds(0.1 * sequence as f64);
+                recorder.bearing("a", sequence, arrival);
+                recorder.tracks("a", sequence, arrival.plus_seconds(late_s));
+            }
+            assert_eq!(recorder.latency().is_some(), is_known, "{late_s} s");
+        }
+    }
 
     #[test]
     fn a_camera_that_was_started_again_has_no_latency_of_minutes() {

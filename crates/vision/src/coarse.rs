@@ -16,8 +16,8 @@ use crate::state::TargetBelief;
 /// looks like the target from afar. And the most pixels per side that are averaged into one.
 const COARSE_SIDE: usize = 5;
 const MOST_COARSE: usize = 4;
-/// Number of places by which the scene's contrasts are known: their median to a few hundredths. With half of
-/// it a search is not noticeably quicker.
+/// Number of places by which the scene's contrasts are known: their median to a few hundredths.
+/// With half of it a search is not noticeably quicker.
 const ENOUGH_PLACES: usize = 10_000;
 /// Least standard deviation of the scene's contrasts: the steps of the samples make every scene
 /// look like a target by this much.
@@ -83,8 +83,8 @@ impl CoarseReference {
         })
     }
 
-    /// Correlates every placement whose middle is in the given columns and rows of a coarse picture,
-    /// into `scratch.statistics`.
+    /// Correlates every placement whose middle is in the given columns and rows of a coarse
+    /// picture, into `scratch.statistics`.
     pub(crate) fn correlate(
         &self,
         picture: &Plane,

@@ -89,11 +89,10 @@ impl ImageTracker {
         let number = *id;
         *id = if is_candidate { number - 1 } else { number + 1 };
         let id = ImageTrackId(number);
-        let (scratch, config) = (&mut self.scratch, &self.config);
-        let target = match origin {
-            Origin::Given => Follower::given(image, place, scratch, config),
-            Origin::Detected { .. } => Follower::new(image, place, scratch, config),
-        };
+        let mut target = Follower::new(image, place, &mut self.scratch, &self.config);
+        if origin == Origin::Given {
+            target.begin_centring(&self.config);
+        }
         let step = TargetStep { measured: None, score: 1.0, certainty: 1.0, nis: None };
         self.tracks.push(describe(id, &target, TrackPhase::Tentative, step));
         self.followed.push(Followed {
@@ -165,7 +164,8 @@ impl ImageTracker {
                 continue;
             };
             let Some(meant) = self.meant(image, given) else { continue };
-            let target = Follower::given(image, meant, &mut self.scratch, &self.config);
+            let mut target = Follower::new(image, meant, &mut self.scratch, &self.config);
+            target.begin_centring(&self.config);
             let followed = &mut self.followed[index];
             (followed.target, followed.unshown, followed.measured_at) = (target, None, time);
             let step = TargetStep { measured: None, score: 1.0, certainty: 1.0, nis: None };

@@ -53,18 +53,11 @@ impl Follower {
         }
     }
 
-    /// The same for a box that somebody has given.
-    pub(crate) fn given(
-        image: &Plane,
-        place: PixelBox,
-        scratch: &mut Scratch,
-        config: &TrackerConfig,
-    ) -> Self {
-        let mut follower = Self::new(image, place, scratch, config);
-        if let Self::Posterior(target) = &mut follower {
+    /// Begins to put a box right that somebody has given, where its image does not show how.
+    pub(crate) fn begin_centring(&mut self, config: &TrackerConfig) {
+        if let Self::Posterior(target) = self {
             target.state.begin_centring(config);
         }
-        follower
     }
 
     pub(crate) fn step(
@@ -123,7 +116,8 @@ impl Follower {
     }
 
     pub(crate) fn is_seen(&self) -> bool {
-        !matches!(self, Self::Posterior(target) if target.state.unseen_s > 0.0 || target.identity.is_on_probation())
+        let Self::Posterior(target) = self else { return true };
+        target.state.unseen_s <= 0.0 && !target.identity.is_on_probation()
     }
 }
 

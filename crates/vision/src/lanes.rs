@@ -36,31 +36,19 @@ pub(crate) fn ln(x: f32) -> f32 {
 /// Number of values that are computed together.
 pub(crate) const LANES: usize = 8;
 
-/// The greatest of some numbers; minus infinity of none, and those that are not numbers are left out.
+/// The greatest of some numbers; minus infinity of none. Those that are not numbers are left out.
 pub(crate) fn greatest(values: &[f32]) -> f32 {
-    let larger = |one: f32, other: f32| if other > one { other } else { one };
-    let chunks = values.chunks_exact(LANES);
-    let rest = chunks.remainder().iter().copied().fold(f32::NEG_INFINITY, larger);
-    let mut most = Lanes::splat(f32::NEG_INFINITY);
-    for chunk in chunks {
-        for (most, value) in most.0.iter_mut().zip(chunk) {
-            *most = larger(*most, *value);
-        }
-    }
-    most.0.into_iter().fold(rest, larger)
+    let (chunks, rest) = values.as_chunks();
+    let of_lanes =
+        chunks.iter().fold(Lanes::splat(f32::NEG_INFINITY), |most, chunk| most.max(Lanes(*chunk)));
+    of_lanes.0.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
 /// The sum of some numbers.
 pub(crate) fn sum(values: &[f32]) -> f32 {
-    let chunks = values.chunks_exact(LANES);
-    let rest: f32 = chunks.remainder().iter().sum();
-    let mut sums = [0.0; LANES];
-    for chunk in chunks {
-        for (sum, value) in sums.iter_mut().zip(chunk) {
-            *sum += value;
-        }
-    }
-    rest + sums.iter().sum::<f32>()
+    let (chunks, rest) = values.as_chunks();
+    let of_lanes = chunks.iter().fold(Lanes::splat(0.0), |sum, chunk| sum + Lanes(*chunk));
+    rest.iter().sum::<f32>() + of_lanes.0.iter().sum::<f32>()
 }
 
 /// Eight numbers in one: an operation is done to each, by one instruction where there is one.

@@ -30,8 +30,8 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
 
 impl TargetBelief {
     /// Learns contrast, size, direction and appearance from an image, the more the surer the target
-    /// was seen. Returns the probability with which the image was taken for the target's, 0 if nothing was
-    /// learnt.
+    /// was seen. Returns the probability with which the image was taken for the target's, 0 if
+    /// nothing was learnt.
     pub(crate) fn learn(
         &mut self,
         frame: FrameInput<'_>,

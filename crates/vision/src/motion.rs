@@ -17,7 +17,6 @@ use crossfix_filter::{AxisMeasurement, normal_score};
 use nalgebra::{Matrix2, Matrix3, Vector3};
 
 use self::axis::{AxisMotion, OFFSET, POSITION, VELOCITY};
-
 use crate::ImagePoint;
 
 const WAYS: usize = 4;

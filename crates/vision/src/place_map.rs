@@ -1,5 +1,5 @@
-//! Where a lost target may be: one probability of every part (cell) of the image, carried through all the
-//! images of a search (track before detect by a Bayesian filter on a grid).
+//! Where a lost target may be: one probability of every part (cell) of the image, carried through
+//! all the images of a search (track before detect by a Bayesian filter on a grid).
 //!
 //! A small target in noise stands out of no single image, and the likeliest of a hundred thousand
 //! cells is another one. But it is in the next image too, about where it was, and chance is not.
@@ -16,8 +16,8 @@ use crate::lanes;
 const UNSEEN_S: f64 = 1.0;
 const IN_SIGHT_S: f64 = 2.0;
 /// Most that one image says for a cell, nats: what looks like the target by its noise has a
-/// likelihood that no model of noise foresees, but it is elsewhere in the next image. With 4 a tenth
-/// more of small targets in noise is lost, with 10 as many.
+/// likelihood that no model of noise foresees, but it is elsewhere in the next image. With 4 a
+/// tenth more of small targets in noise is lost, with 10 as many.
 const MOST_OF_IMAGE: f32 = 6.0;
 
 /// The distribution over the cells of a picture's grid.
@@ -53,8 +53,8 @@ pub(crate) struct LikeliestCell {
 }
 
 impl PlaceMap {
-    /// A map of cells of `coarseness` px on which nothing is known yet but a `prior`, up to a factor,
-    /// of each cell: whether the target can be seen is as likely as not.
+    /// A map of cells of `coarseness` px on which nothing is known yet but a `prior`, up to a
+    /// factor, of each cell: whether the target can be seen is as likely as not.
     pub(crate) fn new(
         coarseness: usize,
         [width, height]: [usize; 2],
@@ -92,8 +92,8 @@ impl PlaceMap {
         let half = (reach / side).ceil().max(1.0) as usize;
         spread(&self.cells, half, by, buffers);
         let stays = sum(&buffers.cells);
-        // A chain of two states: of what can be seen a share no longer can, and the other way round;
-        // what appears may be anywhere.
+        // A chain of two states: of what can be seen a share no longer can, and the other way
+        // round; what appears may be anywhere.
         let disappears = -(-interval / IN_SIGHT_S).exp_m1();
         let appears = -(-interval / UNSEEN_S).exp_m1();
         let nowhere = f64::from(self.nowhere);

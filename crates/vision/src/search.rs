@@ -12,7 +12,7 @@ use crate::identity::Identity;
 use crate::likelihood::log_ratios;
 use crate::place_map::PlaceMap;
 use crate::scratch::Scratch;
-use crate::search_area::{Best, SearchArea};
+use crate::search_area::{BestCell, SearchArea};
 use crate::search_memory::{Background, SearchMap, SearchMemory};
 use crate::state::TargetBelief;
 
@@ -20,12 +20,12 @@ use crate::state::TargetBelief;
 /// in forty is lost for good, as something else is found and followed; with 0.999 an eighth more of
 /// the frames of small targets in noise are lost.
 const SURE_PLACE: f32 = 0.99;
-/// The best place of a single picture (and a find of the detector, by the first of these) is accepted
-/// if its log likelihood ratio, less the scene's own there, is at least `LEAST_RATIO` and at least
-/// `MARGIN` above that of the next best place, and if its contrast is by `ABOVE_CHANCE` nats likelier
-/// the target's than the best one's of all places searched. On the shared and drawn cases half of the
-/// places that such a search takes for the target are others' without the last condition, and with 4 a
-/// third; with twice as much an eighth of the right ones is refused.
+/// The best place of a single picture (and a find of the detector, by the first of these) is
+/// accepted if its log likelihood ratio, less the scene's own there, is at least `LEAST_RATIO` and
+/// at least `MARGIN` above that of the next best place, and if its contrast is by `ABOVE_CHANCE`
+/// nats likelier the target's than the best one's of all places searched. On the shared and drawn
+/// cases half of the places that such a search takes for the target are others' without the last
+/// condition, and with 4 a third; with twice as much an eighth of the right ones is refused.
 pub(crate) const LEAST_RATIO: f32 = 3.0;
 const MARGIN: f32 = 1.0;
 const ABOVE_CHANCE: f64 = 4.0;
@@ -50,9 +50,9 @@ pub(crate) struct Sought<'a> {
 }
 
 impl Sought<'_> {
-    /// Searches for it: in the image, after a second by its first appearance; and every other time in
-    /// what has changed, by turns by its last appearance and its first. It keeps the appearance by
-    /// which it is found.
+    /// Searches for it: in the image, after a second by its first appearance; and every other time
+    /// in what has changed, by turns by its last appearance and its first. It keeps the appearance
+    /// by which it is found.
     pub(crate) fn find(
         &mut self,
         frame: FrameInput<'_>,
@@ -96,7 +96,7 @@ impl Sought<'_> {
         let searched = Searched { picture: frame.image, noise: self.state.noise, likeness };
         let is_sure = likeliest.probability >= SURE_PLACE;
         if !is_sure {
-            let best = area.best_place(&area.prior(self.state, frame.config), scratch);
+            let best = area.best_cell(&area.prior(self.state, frame.config), scratch);
             let scene = seen.and_then(|at| area.empty_scene(sides, turned, at, self.memory));
             let background = scene.map_or(0.0, |scene| scene.at(best.cell));
             return self.clear_find(frame, searched, (&area, best, background), scratch);
@@ -144,7 +144,7 @@ impl Sought<'_> {
         let expected = coarse.expectation(state, noise, config);
         log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
         let searched = Searched { picture: change, noise, likeness: coarse.likeness(scratch) };
-        let best = area.best_place(&area.prior(state, config), scratch);
+        let best = area.best_cell(&area.prior(state, config), scratch);
         self.clear_find(frame, searched, (&area, best, 0.0), scratch)
     }
 
@@ -154,7 +154,7 @@ impl Sought<'_> {
         &mut self,
         frame: FrameInput<'_>,
         searched: Searched<'_>,
-        (area, best, background): (&SearchArea, Best, f32),
+        (area, best, background): (&SearchArea, BestCell, f32),
         scratch: &mut Scratch,
     ) -> Option<TargetFit> {
         let at = (area.place_of(best.cell), area.coarseness + 1);
@@ -169,8 +169,8 @@ impl Sought<'_> {
         (is_clear && self.has_come(frame, &fit, scratch)).then_some(fit)
     }
 
-    /// The best placement within `reach` px of a place in a picture, and the fit in the image there:
-    /// the image tells the place best, what has changed has the noise of two pictures.
+    /// The best placement within `reach` px of a place in a picture, and the fit in the image
+    /// there: the image tells the place best, what has changed has the noise of two pictures.
     fn at_full_resolution(
         &mut self,
         frame: FrameInput<'_>,

@@ -12,7 +12,7 @@ use crate::state::TargetBelief;
 use crate::{ImagePoint, TrackerConfig};
 
 /// The best placement on the coarse picture.
-pub(crate) struct Best {
+pub(crate) struct BestCell {
     /// Its column and row.
     pub(crate) cell: [usize; 2],
     /// Its log likelihood ratio, less that of the next best place.
@@ -147,7 +147,7 @@ impl SearchArea {
     }
 
     /// The likeliest place, by the log likelihood ratios in `scratch.ratios`.
-    pub(crate) fn best_place(&self, prior: &AreaPrior, scratch: &Scratch) -> Best {
+    pub(crate) fn best_cell(&self, prior: &AreaPrior, scratch: &Scratch) -> BestCell {
         let Self { ranges, .. } = self;
         let (mut best, mut most) = ([0, 0], f64::NEG_INFINITY);
         let most_prior = prior.most().ln();
@@ -184,7 +184,7 @@ impl SearchArea {
             rival = rival.max(beside);
         }
         let (column, row) = (ranges[0].start + best[0], ranges[1].start + best[1]);
-        Best { cell: [column, row], margin: scratch.ratios.row(best[1])[best[0]] - rival }
+        BestCell { cell: [column, row], margin: scratch.ratios.row(best[1])[best[0]] - rival }
     }
 
     /// What the scene itself had at the places of a coarse picture with these sides, given how it

@@ -11,9 +11,10 @@ use crate::search::LEAST_RATIO;
 /// as bright as the sky behind it. With half of it a panning camera's target is right in 96.5 % of
 /// the frames instead of 97.5, and longer taken for something else.
 const SIZES: f64 = 2.5;
-/// Least share of the reference's energy that is the target's: one with much noise in it finds itself in
-/// anything, and what moves there is then not followed as what it is. From 0.6 to 0.9 the same
-/// is found; with half of it one sequence of 228, whose target no image shows at first, is lost for good.
+/// Least share of the reference's energy that is the target's: one with much noise in it finds
+/// itself in anything, and what moves there is then not followed as what it is. From 0.6 to 0.9 the
+/// same is found; with half of it one sequence of 228, whose target no image shows at first, is
+/// lost for good.
 const LEAST_CLEAR: f32 = 0.7;
 /// How far its middle may be off, in the larger sides.
 const OFF_SIDES: f64 = 0.5;

@@ -1,8 +1,8 @@
 //! What is believed of one target: its appearance, its motion, and how well it can be seen.
 //!
 //! The stages of a step read and change it: the gate (`gate.rs`), the fit (`fit.rs`), learning
-//! (`learning.rs`), and where the target is lost the search (`search.rs`). [`crate::followed_target`] puts
-//! them together.
+//! (`learning.rs`), and where the target is lost the search (`search.rs`).
+//! [`crate::followed_target`] puts them together.
 
 use crossfix_correlation::Plane;
 use crossfix_filter::AxisMeasurement;
@@ -26,6 +26,9 @@ pub(crate) const SEEN: f64 = 0.5;
 /// second, and their largest variances.
 const SHAPE_WALK: [f64; 2] = [0.006, 0.02];
 const MOST_SHAPE_VARIANCE: [f64; 2] = [0.09, 0.25];
+/// Variances of both of a reference that has just been cut out: it has the target's size and
+/// direction by definition, but for what keeps a variance from being zero.
+pub(crate) const CUT_OUT_SHAPE: [f64; 2] = [1e-6; 2];
 
 /// State of the belief about one target.
 #[derive(Clone, Debug)]
@@ -84,7 +87,7 @@ impl TargetBelief {
             contrast: 1.0,
             contrast_variance: 0.0,
             usual_contrast: 1.0,
-            shape_variances: [1e-6; 2],
+            shape_variances: CUT_OUT_SHAPE,
             missed: 0,
             unseen_s: 0.0,
             last_seen: centre,

@@ -318,8 +318,8 @@ impl CameraSource<'_> {
     }
 
     /// Standard deviation of the camera's times, s: the time in which the drone moves by as much as
-    /// the fit's residual, as what is left there may be the clock's error as well as the pose's; and
-    /// what a clock that wanders differs by from a line that is fitted to it.
+    /// the fit's residual, as what is left there may be the clock's error as well as the pose's;
+    /// and what a clock that wanders differs by from a line that is fitted to it.
     fn clock_sd_s(&self, labels: &[ImportedLabel], model: &CameraModel) -> f64 {
         let direction = |label: &ImportedLabel| model.direction(label.pixel?).ok();
         let mut squared_rates = Vec::new();
@@ -368,11 +368,11 @@ impl CameraSource<'_> {
             .with_clock_wander(self.clock_wander_s()))
     }
 
-    /// Random wander of the camera's clock, s after one second: as if the whole rate r that was fitted
-    /// came from frames that were lost, or taken twice. Each moves the clock by a frame's period p;
-    /// there are r / p a second, at random (Poisson), so the variance grows by r p a second. How
-    /// many of them the lens file's rate of frames contains is not known, but four times as many, or
-    /// a quarter, give the same tracks to a tenth. 0.4 to 8 ms for these cameras.
+    /// Random wander of the camera's clock, s after one second: as if the whole rate r that was
+    /// fitted came from frames that were lost, or taken twice. Each moves the clock by a frame's
+    /// period p; there are r / p a second, at random (Poisson), so the variance grows by r p a
+    /// second. How many of them the lens file's rate of frames contains is not known, but four
+    /// times as many, or a quarter, give the same tracks to a tenth. 0.4 to 8 ms for these cameras.
     fn clock_wander_s(&self) -> f64 {
         (self.fitted.clock_rate.abs() / self.lens.fps).sqrt()
     }
