@@ -6,9 +6,10 @@
 // one of them is not there.
 import { existsSync } from "node:fs";
 import { createRequire } from "node:module";
+import { resolve } from "node:path";
 
 const [url, text, picture] = process.argv.slice(2);
-const modules = createRequire(`${process.env.CROSSFIX_NODE ?? "."}/node_modules/`);
+const modules = createRequire(`${resolve(process.env.CROSSFIX_NODE ?? ".")}/node_modules/`);
 let playwright;
 try {
   playwright = modules("playwright-core");
