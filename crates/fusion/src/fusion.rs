@@ -56,6 +56,16 @@ pub struct CameraReport {
     pub clock: Option<ClockEstimate>,
 }
 
+/// What a camera said of an exposure's time, and by which estimate of its clock that was corrected.
+#[derive(Clone, Copy, Debug)]
+struct Reported {
+    time: Timestamp,
+    /// Standard deviation, s.
+    sd_s: f64,
+    /// [`ClockEstimator::changes`] as of the correction.
+    known: u64,
+}
+
 /// The fusion centre as a state machine: frames in, tracks out; without clock, thread or socket of
 /// its own.
 #[derive(Debug)]
@@ -69,7 +79,7 @@ pub struct Fusion {
     unmet: Unmet,
     site_time: SiteTime,
     /// Exposures ordered by capture time less the estimated offset of their camera's clock.
-    corrected: ReorderQueue<()>,
+    corrected: ReorderQueue<Reported>,
     smoothing: Smoothing,
     cueing: Cueing,
     counters: Counters,
@@ -278,29 +288,45 @@ impl Fusion {
     /// Subtracts the clock's estimated offset from an exposure's time. The corrected times may come
     /// in another order, so an exposure waits until no camera's clock can be far enough ahead for
     /// an earlier exposure still to come.
-    fn correct(&mut self, mut exposure: Exposure, outputs: &mut Vec<Output>) {
+    fn correct(&mut self, exposure: Exposure, outputs: &mut Vec<Output>) {
         self.clocks.see(&exposure.camera, &exposure.uncertainty);
-        let Some(clock) = self.clock(&exposure.camera) else {
+        if self.clock(&exposure.camera).is_none() {
             return self.process(&exposure, outputs);
-        };
-        let reported = exposure.time;
-        exposure.correction_s = clock.offset_s;
-        exposure.time = reported.plus_seconds(-clock.offset_s);
-        let said = exposure.uncertainty.time_sd_s;
-        exposure.uncertainty.time_sd_s = self.clocks.time_sd_s(&exposure.camera, &clock, said);
+        }
+        let time = exposure.time;
+        let said = Reported { time, sd_s: exposure.uncertainty.time_sd_s, known: 0 };
+        self.wait(exposure, said, outputs);
+        // No exposure to come can be corrected to before this: times come in order, less the
+        // largest offset.
+        let settled = time.plus_seconds(-self.clocks.largest_offset());
+        while let Some((next, said)) = self.corrected.pop_settled(Some(settled)) {
+            // Of one clock no two estimates may be in use by turns: tracks would take each change
+            // for news of their errors.
+            if said.known == self.clocks.changes() {
+                self.process(&next, outputs);
+            } else {
+                self.wait(next, said, outputs);
+            }
+        }
+    }
+
+    /// Corrects the time of an exposure by what is known of the clocks now, and keeps the exposure
+    /// until nothing can come before it.
+    fn wait(&mut self, mut exposure: Exposure, said: Reported, outputs: &mut Vec<Output>) {
+        if let Some(clock) = self.clock(&exposure.camera) {
+            exposure.correction_s = clock.offset_s;
+            exposure.time = said.time.plus_seconds(-clock.offset_s);
+            let sd_s = self.clocks.time_sd_s(&exposure.camera, &clock, said.sd_s);
+            exposure.uncertainty.time_sd_s = sd_s;
+        }
         if let Some(by_s) = self.buffer.passed_by_s(exposure.time) {
             return self.refuse(exposure.refused(RejectionReason::Late { by_s }), outputs);
         }
-        if self.corrected.holds(&exposure, reported) {
+        if self.corrected.holds(&exposure, said.time) {
             return self.refuse(exposure.refused(RejectionReason::Duplicate), outputs);
         }
-        self.corrected.insert(exposure, reported, ());
-        // No exposure to come can be corrected to before this: times come in order, less the
-        // largest offset.
-        let settled = reported.plus_seconds(-self.clocks.largest_offset());
-        while let Some((next, ())) = self.corrected.pop_settled(Some(settled)) {
-            self.process(&next, outputs);
-        }
+        let known = self.clocks.changes();
+        self.corrected.insert(exposure, said.time, Reported { known, ..said });
     }
 
     /// The standard deviation of an exposure's time against true time, s.

@@ -435,6 +435,11 @@ impl Track {
         self.ties.values_mut().for_each(|ties| ties.step_time(step_s));
     }
 
+    /// Time from its beginning to its latest bearing, s.
+    pub(crate) fn age_s(&self) -> f64 {
+        self.updated.seconds_since(self.born)
+    }
+
     /// Whether it has been confirmed and is not lost.
     pub fn is_confirmed(&self) -> bool {
         matches!(

@@ -24,6 +24,10 @@ use crate::{Exposure, Sighting, Tracking};
 const MERGE_GATE: f64 = 11.34;
 /// Every track's state is published at least this often, s.
 const PUBLISHED_EVERY_S: f64 = 0.5;
+/// A track that two cameras alone see says how well poses are known from this age on, s: before, the
+/// two may see different things that pass each other, and would make room for more such tracks. With
+/// half of it they do; with twice as much two cameras take as much longer to show that they err.
+const OF_ONE_S: f64 = 5.0;
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct TrackChange {
@@ -269,7 +273,10 @@ impl Tracker {
     /// due.
     pub(crate) fn draws(&mut self) -> Vec<Vec<ScaleSample>> {
         let sure = self.tracks.values_mut().filter(|track| track.is_confirmed() && track.is_held());
-        sure.map(Track::draw).filter(|samples| samples.len() >= 2).collect()
+        let draws = sure.map(|track| (track.age_s(), track.draw()));
+        let least = |age_s: f64| if age_s < OF_ONE_S { 3 } else { 2 };
+        let enough = draws.filter(|(age_s, samples)| samples.len() >= least(*age_s));
+        enough.map(|(_, samples)| samples).collect()
     }
 
     /// Passes on that a camera's pose error variance was found to be `ratio` times what was

@@ -30,8 +30,6 @@ const LARGEST_STEP: f64 = 2.5;
 /// A draw counts as no more than this many times its expectation: a target whose bearings were
 /// mixed up with another's for a moment must not be remembered for ten draws.
 const MOST_OF_A_DRAW: f64 = 30.0;
-/// Fewer cameras cannot tell whose error it is: two lines that miss each other accuse neither.
-const LEAST_ACCUSERS: usize = 3;
 /// Least factor (variance) on a careful survey's pose covariance: a microradian, which keeps
 /// covariances regular. With ten microradians tracks seen from kilometres away claimed to know half
 /// of what they did.
@@ -105,15 +103,9 @@ impl PoseScale {
         (self.expected > 0.0).then_some(step)
     }
 
-    /// Takes in the squared pose error that a draw of `accusers` cameras has found, and its
-    /// expectation, with the typical factor of the site's cameras; returns by how much the tracks'
-    /// factor changes, if it does.
-    fn learn(
-        &mut self,
-        (found, expected): (f64, f64),
-        accusers: usize,
-        typical: f64,
-    ) -> Option<f64> {
+    /// Takes in the squared pose error that a draw has found, and its expectation, with the typical
+    /// factor of the site's cameras; returns by how much the tracks' factor changes, if it does.
+    fn learn(&mut self, (found, expected): (f64, f64), typical: f64) -> Option<f64> {
         if !(found.is_finite() && expected.is_finite() && expected > 0.0) {
             return None;
         }
@@ -128,11 +120,8 @@ impl PoseScale {
         // factor * sqrt((found + n t / factor) / (expected + n)).
         let found = self.found + TYPICAL_WEIGHT * typical / self.value;
         let step = (found / (self.expected + TYPICAL_WEIGHT)).sqrt();
-        // Two cameras can clear each other, but not accuse.
-        let most = if accusers < LEAST_ACCUSERS { 1.0 } else { LARGEST_STEP };
-        let next = self.value * step.min(most);
-        let next = next.clamp(self.value / LARGEST_STEP, self.value * LARGEST_STEP);
-        let next = next.clamp(self.least, self.greatest);
+        let step = step.clamp(LARGEST_STEP.recip(), LARGEST_STEP);
+        let next = (self.value * step).clamp(self.least, self.greatest);
         // Under the new factor the errors found so far come out smaller: not at all where noise
         // hides the pose error, inversely to the factor where the pose error is all. The root is
         // between the two. Compared under the old factor one error would count ten times; the
@@ -160,7 +149,7 @@ impl Cameras {
         let drawn = samples.iter().zip(found);
         let changed = drawn.filter_map(|(sample, found)| {
             let scale = &mut self.get_mut(&sample.camera)?.pose_scale;
-            Some((sample.camera.clone(), scale.learn(found, samples.len(), typical)?))
+            Some((sample.camera.clone(), scale.learn(found, typical)?))
         });
         changed.collect()
     }

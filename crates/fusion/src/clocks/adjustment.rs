@@ -15,8 +15,9 @@ const HUBER: f64 = 9.0;
 const OUTLIER: f64 = 22.0;
 /// Median of a squared distance of two degrees of freedom.
 const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
-/// Largest factor on a camera's covariances.
-const MAX_SCALE: f64 = 1e4;
+/// Largest factor on a camera's covariances: larger residuals are due to a mistake, not to noise, and
+/// are not made likely by taking them for noise.
+pub(super) const MAX_SCALE: f64 = 16.0;
 /// Most iterations of one descent; most descents take three to six.
 const MAX_ROUNDS: usize = 25;
 /// Levenberg-Marquardt damping relative to the diagonal: at first, and when a descent is given up.

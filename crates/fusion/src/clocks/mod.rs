@@ -122,6 +122,8 @@ pub(crate) struct ClockEstimator {
     needed: bool,
     /// Windows in a row that contradicted everything learnt before.
     refused: u32,
+    /// How many times what is known of the clocks has changed.
+    changes: u64,
 }
 
 impl ClockEstimator {
@@ -139,7 +141,14 @@ impl ClockEstimator {
             round: None,
             needed: false,
             refused: 0,
+            changes: 0,
         }
+    }
+
+    /// How many times what is known of the clocks has changed: times that were corrected by an
+    /// earlier estimate are to be corrected anew.
+    pub(crate) fn changes(&self) -> u64 {
+        self.changes
     }
 
     /// Whether any clock is uncertain enough to be estimated.
@@ -217,6 +226,7 @@ impl ClockEstimator {
 
     /// Discards the result of the open windows so far: a camera is new, or no longer as it was.
     fn forget_provisional(&mut self) {
+        self.changes += 1;
         self.provisional = None;
         self.round = None;
     }
@@ -257,6 +267,7 @@ impl ClockEstimator {
         if let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
             let window = self.windows.remove(index);
             self.close(&window);
+            self.changes += 1;
             self.worst_sd_s = self.worst_sd();
             self.round = Some(Round::default());
             self.next_adjustment = now.plus_seconds(PAUSE_S);
@@ -301,7 +312,7 @@ impl ClockEstimator {
         let is_new = !self.windows[index].cameras.contains(camera);
         let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
         let window = &mut self.windows[index];
-        let line = (*line, exposure.uncertainty.declared_lasting);
+        let line = (*line, exposure.uncertainty.declared_lasting, exposure.uncertainty.factor);
         window.add(camera, role, time, line, track.position_at(exposure.time).coords);
     }
 
@@ -327,6 +338,7 @@ impl ClockEstimator {
     /// counts as badly known as it was at the start, until a window determines it.
     pub(crate) fn suspect(&mut self, camera: &CameraName) {
         if self.belief.is_uncertain(camera) {
+            self.changes += 1;
             if let Some(reported) = self.reported.get_mut(camera) {
                 (reported.suspected, reported.cleared) = (true, false);
             }
@@ -398,6 +410,7 @@ impl ClockEstimator {
             reported.cleared = round.cleared.contains(camera);
         }
         self.provisional = round.belief;
+        self.changes += 1;
         // Soon again while a clock that is in use is not well known.
         let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
         self.next_look = self.now.plus_seconds(pause);

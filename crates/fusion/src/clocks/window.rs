@@ -59,6 +59,9 @@ pub(super) struct TrackWindow {
     links: usize,
     /// Number of bearings that each camera has offered.
     offered: Vec<usize>,
+    /// White part of each camera's noise, as a factor on the reported variance, by its newest
+    /// bearing.
+    white: Vec<f64>,
 }
 
 impl TrackWindow {
@@ -71,17 +74,19 @@ impl TrackWindow {
             thinned: 1,
             links: 0,
             offered: Vec::new(),
+            white: Vec::new(),
         }
     }
 
-    /// Takes in a bearing, stamped by the camera's own clock, with the part of its errors that lasts
-    /// and where the track has the target.
+    /// Takes in a bearing, stamped by the camera's own clock, with the part of its errors that is
+    /// declared to last, the factor on its variance that is white noise, and where the track has the
+    /// target.
     pub(super) fn add(
         &mut self,
         camera: &CameraName,
         role: Role,
         time: Timestamp,
-        (mut line, lasting): (SightLine, CorrelatedNoise),
+        (mut line, lasting, white): (SightLine, CorrelatedNoise, f64),
         place: Vector3<f64>,
     ) {
         let time_s = time.seconds_since(self.start);
@@ -98,8 +103,10 @@ impl TrackWindow {
             self.links += usize::from(role == Role::Link);
             self.cameras.push(camera.clone());
             self.offered.push(0);
+            self.white.push(white);
             self.cameras.len() - 1
         });
+        self.white[index] = white;
         let number = self.offered[index];
         self.offered[index] += 1;
         if number.is_multiple_of(self.thinned) {
@@ -139,6 +146,32 @@ impl TrackWindow {
         })
     }
 
+    /// For how long a camera's bearings are of times at which another sees the target, s, where its
+    /// clock (by index in the window) is ahead by so much.
+    pub(super) fn together_s(&self, camera: usize, ahead_s: impl Fn(usize) -> f64) -> f64 {
+        let mut own = (f64::INFINITY, f64::NEG_INFINITY);
+        let mut others = own;
+        for sight in &self.sights {
+            let time_s = sight.time_s - ahead_s(sight.camera);
+            let (first, last) = if sight.camera == camera { &mut own } else { &mut others };
+            (*first, *last) = (first.min(time_s), last.max(time_s));
+        }
+        own.1.min(others.1) - own.0.max(others.0)
+    }
+
+    /// Factor by which a camera's bearings repeat one another whose residuals have `scale` times the
+    /// reported variance: what of that is neither reported nor shown to be white by differences of
+    /// successive bearings lasts.
+    pub(super) fn repetition(&self, camera: usize, scale: f64) -> f64 {
+        let own = self.sights.iter().filter(|sight| sight.camera == camera);
+        let times: Vec<f64> = own.map(|sight| sight.time_s).collect();
+        let span_s = times.last().zip(times.first()).map_or(0.0, |(last, first)| last - first);
+        let interval_s = span_s / times.len().max(1) as f64;
+        let lasting = CorrelatedNoise { sd_rad: 1.0, ..CorrelatedNoise::NONE };
+        let excess = (1.0 - self.white[camera].max(1.0) / scale).max(0.0);
+        1.0 - excess + excess * lasting.as_white(interval_s)
+    }
+
     /// Indices of the cameras that have given enough bearings to be checked.
     fn checked_indices(&self) -> Vec<usize> {
         let count = |index: usize| self.sights.iter().filter(|sight| sight.camera == index).count();
@@ -169,6 +202,7 @@ impl TrackWindow {
             cameras: self.checked_cameras(),
             sights: self.sights.iter().filter_map(moved).collect(),
             offered: kept.iter().map(|index| self.offered[*index]).collect(),
+            white: kept.iter().map(|index| self.white[*index]).collect(),
             ..*self
         }
     }
@@ -192,7 +226,7 @@ mod tests {
                 &camera,
                 Role::Wanted,
                 time,
-                (line, CorrelatedNoise::NONE),
+                (line, CorrelatedNoise::NONE, 1.0),
                 Vector3::zeros(),
             );
         }
@@ -219,7 +253,7 @@ mod tests {
                 &camera,
                 role,
                 Timestamp::from_seconds(f64::from(k) / 60.0),
-                (line, CorrelatedNoise::NONE),
+                (line, CorrelatedNoise::NONE, 1.0),
                 Vector3::zeros(),
             );
         }

@@ -4,15 +4,14 @@
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::DMatrix;
 
-use super::adjustment::{AdjustedCameras, Adjustment, ClockAndPosePrior, Unknowns};
+use super::adjustment::{AdjustedCameras, Adjustment, ClockAndPosePrior, MAX_SCALE, Unknowns};
 use super::belief::Belief;
 use super::curve::Curve;
 use super::window::TrackWindow;
 
-/// Least span of a window, s: bearings of less say nothing that can be checked.
+/// Least span of a window, and least time for which a camera whose clock has jumped sees the target
+/// together with another, s: bearings of less say nothing that can be checked.
 const LEAST_WINDOW_S: f64 = 1.0;
-/// Residuals larger than this (squared, over what was reported) are due to a mistake, not to noise.
-const MAX_SCALE: f64 = 16.0;
 /// A camera of which more than this share of bearings are outliers, of other objects, does not fit itself.
 const MAX_OUTLIERS: f64 = 0.3;
 /// Residuals larger than this, or clocks farther than this from their prior (both squared, over
@@ -53,8 +52,8 @@ struct JumpTest<'a> {
     now: Timestamp,
     components: Vec<usize>,
     window: &'a TrackWindow,
-    /// Factors by which the bearings of its cameras repeat one another.
-    inflations: Vec<f64>,
+    /// Factors by which the bearings of its cameras have repeated one another in earlier windows.
+    known: Vec<Option<f64>>,
 }
 
 /// The belief after a window. If the window does not fit it well, a camera's clock may have jumped.
@@ -72,17 +71,28 @@ pub(super) fn window_update(belief: &Belief, window: &TrackWindow) -> WindowUpda
         return WindowUpdate::Uninformative;
     }
     let components = components(&belief, &window);
-    let inflations = vec![1.0; window.cameras.len()];
-    JumpTest { belief, now, components, window: &window, inflations }.learn()
+    let known = window.cameras.iter().map(|camera| belief.inflation(camera)).collect();
+    JumpTest { belief, now, components, window: &window, known }.learn()
+}
+
+/// A window fitted after a jump of a clock.
+struct Jump {
+    /// The belief before the window, with the clock in doubt.
+    belief: Belief,
+    adjusted: AdjustedCameras,
+    /// By how much more likely (twice the logarithm) the window is than without the jump, ...
+    gain: f64,
+    /// ... and whether it fits without it.
+    fitted: bool,
 }
 
 impl JumpTest<'_> {
     fn learn(mut self) -> WindowUpdate {
-        self.inflations = self.expected_inflations();
-        let plain = self.fit(&self.belief, self.window);
+        let plain = self.fit(&self.belief);
         let fitting = plain.as_ref().filter(|adjusted| fits(adjusted));
-        if let Some(adjusted) = fitting.filter(|adjusted| !is_suspicious(adjusted)) {
-            return WindowUpdate::Accepted(Box::new(self.learnt(self.belief.clone(), adjusted)));
+        let unmoved = fitting.map(|adjusted| self.learnt(self.belief.clone(), adjusted));
+        if let (Some(belief), false) = (&unmoved, fitting.is_some_and(is_suspicious)) {
+            return WindowUpdate::Accepted(Box::new(belief.clone()));
         }
         // Try a jump within the window first, then for each suspect a jump before it, at a price.
         let suspects = self.suspects(plain.as_ref());
@@ -91,21 +101,13 @@ impl JumpTest<'_> {
         {
             return WindowUpdate::Accepted(Box::new(belief));
         }
-        // A fit without a jump sets the evidence to beat, even where it is a bad fit.
-        let evidence = plain.as_ref().map_or(f64::NEG_INFINITY, |adjusted| adjusted.evidence);
-        let unmoved = fitting.map(|adjusted| self.learnt(self.belief.clone(), adjusted));
-        let mut best = (evidence, unmoved);
+        // The prior probability of a jump, as a price on the evidence.
+        let mut best = (JUMP, unmoved);
         for camera in suspects {
-            let mut doubting = self.belief.clone();
-            doubting.doubt_jumped(camera);
-            let Some(adjusted) = self.fit(&doubting, self.window).filter(fits) else {
-                continue;
-            };
-            // The prior probability of a jump, as a price on the evidence.
-            let evidence = adjusted.evidence - JUMP;
-            let jumped = self.learnt(doubting, &adjusted);
-            if evidence > best.0 && self.shows_jump(camera, &jumped) {
-                best = (evidence, Some(jumped));
+            let Some(jump) = self.jump(camera, self.window, plain.as_ref()) else { continue };
+            let jumped = self.learnt(jump.belief, &jump.adjusted);
+            if jump.gain > best.0 && self.shows_jump(camera, self.window, &jumped) {
+                best = (jump.gain, Some(jumped));
             }
         }
         if let (_, Some(belief)) = best {
@@ -114,25 +116,49 @@ impl JumpTest<'_> {
         // Nothing fits: try without anything learnt before.
         self.belief.reset_all();
         self.components = components(&self.belief, self.window);
-        let anew = self.fit(&self.belief, self.window).filter(fits);
+        let anew = self.fit(&self.belief).filter(fits);
         anew.map_or(WindowUpdate::Uninformative, |adjusted| {
             WindowUpdate::Contradicts(Box::new(self.learnt(self.belief.clone(), &adjusted)))
         })
     }
 
-    /// Factors by which the bearings of the window's cameras repeat one another: as in earlier
-    /// windows, or, where a camera is new, as in a first fit.
-    fn expected_inflations(&self) -> Vec<f64> {
-        let known = self.window.cameras.iter().map(|camera| self.belief.inflation(camera));
-        let known: Vec<Option<f64>> = known.collect();
-        let first = known.iter().any(Option::is_none).then(|| self.fit(&self.belief, self.window));
-        let found = |index: usize| Some(first.as_ref()?.as_ref()?.inflations[index]);
-        let expected = |(index, known): (usize, &Option<f64>)| known.or_else(|| found(index));
-        known.iter().enumerate().map(|known| expected(known).unwrap_or(1.0)).collect()
+    /// Fits the window, and again once the first fit has shown how large its residuals are.
+    fn fit(&self, belief: &Belief) -> Option<AdjustedCameras> {
+        let first = self.fit_once(belief, self.window, &[])?;
+        self.fit_once(belief, self.window, &[&first])
     }
 
-    fn fit(&self, belief: &Belief, window: &TrackWindow) -> Option<AdjustedCameras> {
-        adjust(belief, window, &self.components, &self.inflations)
+    /// One fit of a window, where others have shown how large the residuals are.
+    fn fit_once(
+        &self,
+        belief: &Belief,
+        window: &TrackWindow,
+        shown: &[&AdjustedCameras],
+    ) -> Option<AdjustedCameras> {
+        adjust(belief, window, &self.components, &self.repetitions(window, shown))
+    }
+
+    /// Factors by which the bearings of a window's cameras repeat one another: as in earlier
+    /// windows, or, where a camera is new, as fits have shown. What is larger of the last one's
+    /// residuals than both the reported noise and the white one is of errors that last.
+    ///
+    /// The trajectory follows the errors of the camera that counts for most, which then shows none
+    /// and counts for all the more. So no camera's factor is below what is typical of the window's
+    /// cameras, their geometric mean.
+    fn repetitions(&self, window: &TrackWindow, shown: &[&AdjustedCameras]) -> Vec<f64> {
+        let found = |index: usize| shown.iter().map(move |fit| fit.inflations[index]);
+        let of_camera = |(index, known): (usize, &Option<f64>)| {
+            known.unwrap_or_else(|| found(index).fold(1.0, f64::max))
+        };
+        let factors: Vec<f64> = self.known.iter().enumerate().map(of_camera).collect();
+        let logarithms = factors.iter().map(|factor| factor.ln());
+        let typical = (logarithms.sum::<f64>() / factors.len() as f64).exp();
+        let at_least = |(index, factor): (usize, &f64)| {
+            let last = shown.last();
+            let left = last.map_or(1.0, |fit| window.repetition(index, fit.scales[index]));
+            factor.max(typical).max(left)
+        };
+        factors.iter().enumerate().map(at_least).collect()
     }
 
     fn learnt(&self, mut belief: Belief, adjusted: &AdjustedCameras) -> Belief {
@@ -156,26 +182,51 @@ impl JumpTest<'_> {
         }
         let (first, last) = self.window.span()?;
         let later = self.window.without_early((first + last) / 2.0, camera);
-        let mut doubting = self.belief.clone();
-        doubting.doubt_jumped(camera);
-        let after = self.fit(&doubting, &later).filter(fits)?;
+        let jump = self.jump(camera, &later, plain)?;
         // Both must hold: the later half fits better without the earlier one, and it does not fit
         // as well with the clock as it was.
-        let much_better = plain.is_none_or(|plain| strange(&after) * BETTER < strange(plain));
-        let before = self.fit(&self.belief, &later).filter(fits);
+        let much_better =
+            plain.is_none_or(|plain| strange(&jump.adjusted) * BETTER < strange(plain));
         // Where nothing was known of the clock yet, the evidences are even: nothing favours the old
-        // clock.
-        let jumped = before.is_none_or(|before| after.evidence + EVEN > before.evidence);
-        let learnt = self.learnt(doubting, &after);
-        (much_better && jumped && self.shows_jump(camera, &learnt)).then_some(learnt)
+        // clock. Where the old one does not fit at all, the new one must explain more.
+        let jumped = jump.gain > if jump.fitted { -EVEN } else { JUMP };
+        let learnt = self.learnt(jump.belief, &jump.adjusted);
+        (much_better && jumped && self.shows_jump(camera, &later, &learnt)).then_some(learnt)
     }
 
-    /// Whether the belief after a jump of a clock says by how much it has jumped. Where the bearings
-    /// of a camera are moved to a time at which no other camera sees the target, they fit whatever
-    /// they are, and their clock is as unknown as before: that explains nothing.
-    fn shows_jump(&self, camera: &CameraName, jumped: &Belief) -> bool {
-        let offset = |belief: &Belief| belief.estimate(camera, self.now);
-        let (Some(before), Some(after)) = (offset(&self.belief), offset(jumped)) else {
+    /// The fit of a window after a jump of a camera's clock; `None` if it does not fit then either.
+    ///
+    /// The evidences are compared with the noise that the jump leaves: one that explains a few of
+    /// the errors that last, by chance, gains little, and nothing is deducted from one that explains
+    /// them all.
+    fn jump(
+        &self,
+        camera: &CameraName,
+        window: &TrackWindow,
+        plain: Option<&AdjustedCameras>,
+    ) -> Option<Jump> {
+        let mut belief = self.belief.clone();
+        belief.doubt_jumped(camera);
+        let mut shown: Vec<&AdjustedCameras> = plain.into_iter().collect();
+        let first = self.fit_once(&belief, window, &shown).filter(fits)?;
+        shown.push(&first);
+        let adjusted = self.fit_once(&belief, window, &shown).filter(fits)?;
+        let before = self.fit_once(&self.belief, window, &shown);
+        // Without a jump even a bad fit sets the evidence to beat, unless it is none at all: of
+        // bearings that it leaves out it says nothing.
+        let gain = before
+            .as_ref()
+            .filter(|before| !leaves_out(before))
+            .map_or(f64::INFINITY, |before| adjusted.evidence - before.evidence);
+        Some(Jump { belief, adjusted, gain, fitted: before.as_ref().is_some_and(fits) })
+    }
+
+    /// Whether the belief after a jump of a clock, from the bearings of a window, says by how much it
+    /// has jumped. Where the bearings of a camera are moved to a time at which no other camera sees
+    /// the target, they fit whatever they are, and tell nothing of their clock.
+    fn shows_jump(&self, camera: &CameraName, window: &TrackWindow, jumped: &Belief) -> bool {
+        let of = |belief: &Belief, camera| belief.estimate(camera, self.now);
+        let (Some(before), Some(after)) = (of(&self.belief, camera), of(jumped, camera)) else {
             return false;
         };
         // Wald's test, d^2 / var > 18: for one normal parameter it is the ratio of likelihoods that
@@ -183,7 +234,11 @@ impl JumpTest<'_> {
         // determines it says enough.
         let change_s = after.offset_s - before.offset_s;
         let differs = change_s.powi(2) > JUMP * after.relative_sd_s.powi(2);
-        jumped.is_possible() && (differs || after.relative_sd_s < before.relative_sd_s)
+        let ahead_s =
+            |index: usize| of(jumped, &window.cameras[index]).map_or(0.0, |clock| clock.offset_s);
+        let index = window.cameras.iter().position(|known| known == camera);
+        let meets = index.is_some_and(|index| window.together_s(index, ahead_s) >= LEAST_WINDOW_S);
+        jumped.is_possible() && meets && (differs || after.relative_sd_s < before.relative_sd_s)
     }
 
     /// The cameras of the window whose clocks may have jumped, the least fitting first.
@@ -214,8 +269,12 @@ fn components(belief: &Belief, window: &TrackWindow) -> Vec<usize> {
 }
 
 fn fits(adjusted: &AdjustedCameras) -> bool {
-    adjusted.scales.iter().all(|scale| *scale < MAX_SCALE)
-        && adjusted.outlier_shares.iter().all(|share| *share < MAX_OUTLIERS)
+    adjusted.scales.iter().all(|scale| *scale < MAX_SCALE) && !leaves_out(adjusted)
+}
+
+/// Whether too many bearings of a camera are farther off than noise can be.
+fn leaves_out(adjusted: &AdjustedCameras) -> bool {
+    adjusted.outlier_shares.iter().any(|share| *share >= MAX_OUTLIERS)
 }
 
 fn is_suspicious(adjusted: &AdjustedCameras) -> bool {

@@ -24,7 +24,7 @@ impl Fusion {
         while let Some(next) = self.buffer.pop() {
             self.handle(next, outputs);
         }
-        while let Some((exposure, ())) = self.corrected.pop() {
+        while let Some((exposure, _)) = self.corrected.pop() {
             self.process(&exposure, outputs);
         }
     }
@@ -33,7 +33,7 @@ impl Fusion {
     /// is dropped.
     pub(super) fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
         self.counters.count("event_time_restarts");
-        while let Some((exposure, ())) = self.corrected.pop() {
+        while let Some((exposure, _)) = self.corrected.pop() {
             let by_s = exposure.time.seconds_since(time);
             self.refuse(exposure.refused(RejectionReason::Future { by_s }), outputs);
         }

@@ -45,7 +45,7 @@ fn after(
         let line = SightLine { origin, direction, basis, covariance };
         let stamped = Timestamp::EPOCH.plus_seconds(t + if is_b { ahead_s } else { 0.0 });
         let place = Vector3::from(place(t).coords);
-        window.add(&name(camera), Role::Wanted, stamped, (line, CorrelatedNoise::NONE), place);
+        window.add(&name(camera), Role::Wanted, stamped, (line, CorrelatedNoise::NONE, 1.0), place);
     }
     match window_update(&belief, &window) {
         WindowUpdate::Accepted(belief) => {
