@@ -70,9 +70,10 @@ pub struct ClockCorrection {
     pub readout_s: f64,
 }
 
-/// Largest time or clock error that is accepted, s: 30 000 years.
+/// Largest time or clock error that is accepted, s: 30 000 years. With half of it the same.
 const LARGEST_S: f64 = 1e12;
-/// Least stated pointing error of a camera, pixels.
+/// Least stated pointing error of a camera, pixels. It keeps a covariance from being zero; with
+/// half of it the same.
 const LEAST_POINTING_PX: f64 = 1e-4;
 
 /// How well a camera points over its image.
@@ -84,7 +85,9 @@ pub struct OverImage {
     pub sd_rad: f64,
 }
 
-/// Columns and rows of the grid of pixels that stands for an image.
+/// Columns and rows of the grid of pixels that stands for an image. With half as many the outermost
+/// pixels lie an eighth of the width from the sides, and not an eighteenth: corners that the lens
+/// is not known in would not count.
 const GRID: [usize; 2] = [9, 5];
 
 /// Pixels evenly spread over an image.

@@ -11,17 +11,19 @@ use crate::site_file::SiteCalibration;
 /// knocked by.
 const LEAST_MOVED: usize = 3;
 /// Gauss-Newton steps to the move of the site: a common offset, as logs cause, takes three, and a
-/// dozen more until a camera that was knocked no longer counts.
+/// dozen more until a camera that was knocked no longer counts. With half of it such a camera still
+/// draws the site after it.
 const STEPS: usize = 24;
 /// Degrees of freedom of Student's t for all pixels of a camera together: a camera that differs
-/// from the others by ten deviations counts a twentieth.
+/// from the others by ten deviations counts a twentieth. With twice as much it counts a twelfth.
 const FREEDOM: f64 = 4.0;
 /// Priors of the move, which is taken to be none where no sight line determines it: deviations wide
-/// enough to leave what a sight line does determine, m, rad, share.
+/// enough to leave what a sight line does determine, m, rad, share. With half of them the same.
 const UNTOLD: [f64; 7] = [1e3, 1e3, 1e3, 3.0, 3.0, 3.0, 3.0];
 
 /// Least stated deviation of a direction, rad: a calibration that states less counts no more; a
-/// thousandth of a pixel.
+/// thousandth of a pixel. With half of it one that states next to nothing counts four times as
+/// much.
 const LEAST_SAID_RAD: f64 = 1e-6;
 
 /// How two calibrations differ.
@@ -189,6 +191,7 @@ fn sight(one: &CalibratedCamera, other: &CalibratedCamera, pixel: Pixel) -> Opti
         target: one.camera.pose().position() + target,
         from: other.camera.pose().position(),
         direction: direction(other)?,
+        // The calibrations' errors are taken to be independent: their variances add.
         said_rad: said(one)?.hypot(said(other)?).max(LEAST_SAID_RAD),
     })
 }

@@ -11,6 +11,7 @@ use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 
 /// Largest place (m), deviation or variance that is accepted: beyond it sums and squares overflow.
+/// With half of it the same.
 const LARGEST: f64 = 1e12;
 /// Version of the file's form that this build writes, and the only one that it reads.
 const FORM: u32 = 1;
@@ -309,7 +310,8 @@ fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
 /// Whether a matrix may be a covariance. Its numbers have different units, so it is judged as a
 /// correlation matrix.
 fn is_covariance(matrix: &DMatrix<f64>) -> bool {
-    // Tolerance for rounding, and for a person who has shortened the numbers.
+    // Tolerance for rounding, and for a person who has shortened the numbers. With half of it
+    // numbers shortened to five digits may be refused.
     const ABOUT: f64 = 1e-4;
     if !matrix.iter().all(|value| value.abs() < LARGEST) || matrix.diagonal().min() < 0.0 {
         return false;

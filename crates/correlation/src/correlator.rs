@@ -19,12 +19,13 @@ pub enum Route {
 /// Cost model of the two routes, ns: `DIRECT_NS` per multiply-add of the direct route,
 /// `SPECTRAL_NS` per `n log2 n` of a transform of `n` samples. Measured by
 /// `cargo bench -p crossfix-correlation`; only their ratio matters, and near the crossing either
-/// route will do.
+/// route will do. With half of one, the slower route is taken where it costs at most twice as much.
 const DIRECT_NS: f64 = 0.027;
 const SPECTRAL_NS: f64 = 0.30;
 
 /// Sides, in samples, of the pieces into which the spectral route cuts a large gate: transforms of
-/// this size stay in the processor's cache.
+/// this size stay in the processor's cache. With half of each side twice the share of a piece is
+/// overlap, which is computed twice.
 const PIECE: Size = Size { width: 256, height: 128 };
 
 /// Correlates references with gates. Keeps its FFT plans and its buffers, so that the statistics of
@@ -119,6 +120,8 @@ impl Correlator {
         self.centre(gate);
         let centred = std::mem::take(&mut self.centred);
         self.moments.fill(&centred, reference.window());
+        // The kernel sums to 0, so the sum of products is the covariance: the mean of the gate
+        // drops out.
         self.products(&centred, reference.kernel(), Extent::Linear, &mut out.covariance);
         self.centred = centred;
         out.variance.copy_from(&self.moments.square);

@@ -6,7 +6,8 @@ use pulp::{Arch, Simd, WithSimd};
 use crate::Plane;
 
 /// Number of vectors of columns that are accumulated at once; with two rows each, all accumulators
-/// fit the registers of a machine with sixteen of them.
+/// fit the registers of a machine with sixteen of them. With half as many, additions wait for one
+/// another.
 const MOST_VECTORS: usize = 5;
 
 /// The term that is accumulated over a kernel: the only difference between the direct measures.
@@ -162,6 +163,7 @@ impl<T: KernelTerm> Slide<'_, T> {
     ) -> ([S::f32s; V], [S::f32s; V]) {
         let gate = self.gate.padded_from(column, gate_row);
         let kernels = self.kernel.row(y).iter().zip(self.kernel.row(y - 1));
+        // Samples of the gate that are loaded once serve both rows of placements.
         for ((&k, &l), samples) in kernels.zip(gate.windows(V * S::F32_LANES)) {
             let (k, l) = (simd.splat_f32s(k), simd.splat_f32s(l));
             let (samples, _) = S::as_simd_f32s(samples);

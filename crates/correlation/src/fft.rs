@@ -9,7 +9,8 @@ use rustfft::{Fft, FftPlanner};
 
 use crate::Plane;
 
-/// Number of rows that are transposed together: their samples of one column fill a cache line.
+/// Number of rows that are transposed together: their samples of one column fill a cache line. With
+/// half of it each line is fetched twice.
 const ROWS_AT_ONCE: usize = 8;
 
 /// The spectrum of a real plane: `width / 2 + 1` columns of `height` (the rest is their conjugate),

@@ -4,14 +4,17 @@ use pulp::{Arch, Simd, WithSimd};
 use crate::interpolation::{Resampler, Sampled};
 use crate::{Plane, Reference};
 
-/// A step shorter than this ends the fit, px.
+/// A step shorter than this ends the fit, px. With half of it some fits take a step more, and move
+/// by less than this.
 const SETTLED_PX: f64 = 2e-3;
 /// How far a fit may move from its start along each axis, px: farther off there is another peak.
+/// With half of it a fit that starts a pixel beside the target ends short of it.
 const REACH_PX: f64 = 1.5;
 /// Share of the normal matrix' trace that is added to its diagonal: it stays regular where the
-/// image holds no information.
+/// image holds no information. With half of it the same.
 const LEAST_SHARE: f64 = 1e-9;
-/// Information on a given contrast over that which the image gives on it.
+/// Information on a given contrast over that which the image gives on it. With half of it the same:
+/// the fitted contrast is within millionths of the given one.
 const KNOWN: f64 = 1e6;
 /// Number of planes in a fit: model, its derivatives by the four freedoms, image.
 const PLANES: usize = 6;

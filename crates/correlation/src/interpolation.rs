@@ -41,7 +41,9 @@ fn spline_slopes(fraction: f32) -> [f32; TAPS] {
     [-0.5 * rest * rest, (1.5 * f - 2.0) * f, (-1.5 * f + 1.0) * f + 0.5, 0.5 * f * f]
 }
 
-/// Half length, in samples, of the filter that turns samples into spline coefficients.
+/// Half length, in samples, of the filter that turns samples into spline coefficients. What is cut
+/// off begins at 0.04 % of its middle (z^6, see `prefilter`); with half of it at 2 %, and the
+/// spline misses the samples.
 const REACH: usize = 5;
 
 /// The filter that turns samples into spline coefficients: `sqrt(3) z^|k|` with `z = sqrt(3) - 2`,
@@ -174,7 +176,8 @@ pub(crate) struct PlaneSpline {
     coefficients: Plane,
 }
 
-/// Number of samples beyond the border for which there are coefficients.
+/// Number of samples beyond the border for which there are coefficients. A fit with a border of one
+/// that has moved by two samples reads as far: with half of it the spline is bent there.
 const MARGIN: isize = 2;
 
 impl PlaneSpline {
@@ -184,6 +187,7 @@ impl PlaneSpline {
         let (taps, pad) = (prefilter(), MARGIN + REACH as isize);
         let wide = |side: usize, pad: isize| side + 2 * pad as usize;
         let (width, height) = (wide(plane.width(), MARGIN), wide(plane.height(), MARGIN));
+        // Each pass uses up the filter's reach at both ends of its axis, and leaves the margin.
         plane.crop_into(
             -pad,
             -pad,

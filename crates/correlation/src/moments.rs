@@ -28,6 +28,8 @@ impl Moments {
             BoxMeans { gate, squares: true, width, height, columns, rows, out: square }.run();
             return;
         }
+        // A window's weight is a column's times a row's, so each moment takes one pass along each
+        // axis.
         squared.copy_from(gate);
         Arch::new().dispatch(|| squared.samples_mut().iter_mut().for_each(|s| *s *= *s));
         for (plane, out) in [(gate, mean), (&*squared, square)] {

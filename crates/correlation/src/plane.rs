@@ -1,5 +1,6 @@
 /// Number of samples behind the last one that may be read and written without meaning: whole
-/// vectors of columns can then be used at the end of a row.
+/// vectors of columns can then be used at the end of a row. The widest vectors have sixteen lanes:
+/// with half of it their last one ends outside.
 pub(crate) const PADDING: usize = 16;
 
 /// A two-dimensional array of samples, row by row: an image's brightness, a reference, a map of

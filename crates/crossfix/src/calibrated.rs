@@ -54,7 +54,8 @@ impl Calibrated {
 
     /// The message that describes the camera from a time (common time) on.
     pub fn message(&self, from: Timestamp) -> CameraCalibration {
-        /// A row may be read out this long before its frame's time, s.
+        /// A row may be read out this long before its frame's time, s. With half of it the same: no
+        /// read-out takes a second, and half of one lies before the frame's time.
         const EARLIER_S: f64 = 1.0;
         self.site.message(&self.camera, from.plus_seconds(-EARLIER_S))
     }
@@ -123,7 +124,8 @@ fn middle_row(frame: &BearingFrame, camera: &CalibratedCamera) -> f64 {
 #[cfg(feature = "centre")]
 pub fn own_time(frame: &BearingFrame, camera: &CalibratedCamera) -> Timestamp {
     /// Fixed-point steps: the clock's offset changes by less than a hundredth of the change of its
-    /// time, so each step leaves less than a hundredth of the error.
+    /// time, so each step leaves less than a hundredth of the error. With half as many the time of
+    /// a clock that is off by an hour may be 4 ms wrong.
     const STEPS: usize = 6;
     let common = Timestamp::from_nanos(frame.capture_time_ns);
     let row = middle_row(frame, camera);

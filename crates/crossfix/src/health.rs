@@ -10,7 +10,8 @@ use crate::host::HostWatch;
 use crate::metrics::MetricsPage;
 use crate::network;
 
-/// Interval of health reports.
+/// Interval of health reports. With twice as much a single report that is late makes a component
+/// silent to `crossfix status`.
 pub const PERIOD: Duration = Duration::from_secs(1);
 
 /// Where a component's health can be seen beside the site's network.
@@ -66,7 +67,8 @@ impl WatchedCertificate {
     }
 }
 
-/// How often a component checks whether its certificate needs renewal.
+/// How often a component checks whether its certificate needs renewal. With twice as much its
+/// problem is known a minute later.
 const CERTIFICATE_PERIOD: Duration = Duration::from_secs(60);
 
 impl HealthReporter {

@@ -15,11 +15,14 @@ use tokio::sync::Semaphore;
 use tokio::time::{sleep, timeout};
 
 /// Most requests served at the same time; further ones wait. Each takes a file descriptor, and the
-/// camera and the network need some, too.
+/// camera and the network need some, too. With half as many the status page's clients of events, of
+/// which there may be twelve, would take them all.
 pub const ASKING: usize = 16;
-/// How long a request may take to arrive.
+/// How long a request may take to arrive. With half of it clients across a slow network are cut
+/// off; with twice as much a silent one holds its place for two seconds.
 const ASKED_WITHIN: Duration = Duration::from_secs(1);
-/// Pause after a connection could not be accepted because descriptors are short.
+/// Pause after a connection could not be accepted because descriptors are short. With half of it
+/// the same; without it the loop would take a whole core.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// Answers all requests at an address until the process ends. From the first byte of a request to

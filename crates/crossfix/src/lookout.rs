@@ -6,10 +6,12 @@ use crossfix_message::{CameraName, Channel, Key};
 use crossfix_transport::{Link, NetworkConfig, OwnCertificate, Presence};
 
 /// How long a component may be missing before that is logged, and how often it is repeated while
-/// none is present.
+/// none is present. With half of the first a component that is starting is said to be missing; with
+/// half of the second a camera that is alone logs twice as much.
 const PATIENCE: Duration = Duration::from_secs(3);
 const PERIOD: Duration = Duration::from_secs(60);
-/// Most names in a line; the rest is given as a number.
+/// Most names in a line; the rest is given as a number. With half as many the fifth and further
+/// ones would not be named.
 const NAMED: usize = 8;
 
 /// Watches which of the components that this one needs are present, and logs who comes, who goes,

@@ -14,9 +14,11 @@ use prometheus::{CounterVec, GaugeVec, Opts, Registry, TextEncoder};
 use crate::http;
 
 /// How long an exchange may take, from the first byte of the request to the last of the answer, so
-/// that a slow or silent client cannot keep a connection.
+/// that a slow or silent client cannot keep a connection. With half of it a scrape across a slow
+/// network may fail.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
-/// A report older than this means that the component no longer reports its health.
+/// A report older than this means that the component no longer reports its health. They are due
+/// every second: with half of it one that is held up for three seconds would seem dead.
 const STALE: Duration = Duration::from_secs(5);
 
 /// The metrics page; it disappears when the process ends.

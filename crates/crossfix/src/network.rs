@@ -6,7 +6,9 @@ use crossfix_transport::{Link, NetworkConfig, Role, RunId};
 
 use crate::shutdown::Shutdown;
 
-/// How long a router may be silent before that is logged, and how often it is repeated.
+/// How long a router may be silent before that is logged, and how often it is repeated. With half
+/// of the first a router that is starting would be logged as silent; with half of the second a
+/// night without one costs twice as many lines.
 const PATIENCE: Duration = Duration::from_secs(2);
 const PERIOD: Duration = Duration::from_secs(60);
 

@@ -77,7 +77,8 @@ impl Drop for Draft {
     }
 }
 
-/// Most names that are tried for a file whose name is taken.
+/// Most names that are tried for a file whose name is taken. With half as many the 5000th file of
+/// one name would be refused.
 const MOST_NAMES: u32 = 10_000;
 
 /// The wanted name, and those tried where it is taken: `today-2.mcap`, `today-3.mcap` ..

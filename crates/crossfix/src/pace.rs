@@ -10,9 +10,10 @@ pub fn wall_seconds() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
 }
 
-/// How often a wait checks whether to stop.
+/// How often a wait checks whether to stop. With twice as much a stop comes up to a tenth of a
+/// second late.
 const POLL: Duration = Duration::from_millis(50);
-/// Longer waits are cut to this length: about a hundred years, s.
+/// Longer waits are cut to this length: about a hundred years, s. With half of it the same.
 const LONGEST_S: f64 = 3e9;
 
 /// When to handle which data: data time runs `speed` times as fast as a monotonic clock, from

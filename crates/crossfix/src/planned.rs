@@ -9,9 +9,11 @@ use nalgebra::Matrix6;
 
 use crate::config::CameraFile;
 
-/// Frames per second of a camera whose file does not say.
+/// Frames per second of a camera whose file does not say. With half of it a plan expects SDs that
+/// are up to 1.4 times as large.
 const DEFAULT_RATE_HZ: f64 = 30.0;
 /// Standard deviation of an image tracker's target position where none is given, pixels per axis.
+/// With half of it a plan promises SDs that are up to half as large.
 const DEFAULT_PIXEL_SD_PX: f64 = 0.5;
 
 /// A camera described by its file and by the calibration that the file names.

@@ -19,44 +19,55 @@ use nalgebra::{Matrix2, Rotation3, Unit, Vector3};
 
 use self::place::{PredictedDirection, long_axis, place_at, squared_distance};
 
-/// Validity of a cue after it came, s of data time: as far as cues look ahead.
+/// Validity of a cue after it came, s of data time: as far as cues look ahead. With half of it a
+/// camera that gets no cue for a second forgets its target.
 const VALID_S: f64 = 2.0;
 /// Gate on the squared Mahalanobis distance of a track from the cue's prediction, with the sum of
-/// both covariances: P = 0.999 with two degrees of freedom.
+/// both covariances: P = 0.999 with two degrees of freedom. With half of it the target would be
+/// missed in one image of thirty.
 const GATE: f64 = 13.8;
 /// A track is the target once it has been the likeliest for this many images: one could be chance,
 /// as a bird passes through.
 const IMAGES: u32 = 3;
 /// The second-best track's squared distance must be larger by this much: its likelihood is then
-/// twenty times smaller.
+/// twenty times smaller. With half of it 4.5 times would do, and a bird beside the target might be
+/// taken for it.
 const RUNNER_UP: f64 = 6.0;
 /// How far the target may be from the image centre, as a fraction of the half view, before the head
 /// turns again. With more of it a target that changes course leaves the image before the head has
 /// turned; with less the head turns all the time.
 const OFF_MIDDLE: f64 = 0.6;
 /// How long a turn takes, s: while the head turns, the target may be further off by its way in this
-/// time.
+/// time. With half of it a head that turns for so long might be told to turn elsewhere on its way.
 const TURN_S: f64 = 1.0;
-/// A turn by less than this fraction of half the view shows nothing new.
+/// A turn by less than this fraction of half the view shows nothing new. With half of it the camera
+/// is more often blind for a turn that gains little.
 const LEAST_TURN: f64 = 0.1;
-/// The head aims at most this far ahead, s: targets change course.
+/// The head aims at most this far ahead, s: targets change course. With twice as much it waits
+/// where one that changes course never comes.
 const LONGEST_LEAD_S: f64 = 1.5;
 /// How long a head stares at each view of a search, s, counted from when it stands there: a
-/// detector takes half a second to find what moves.
+/// detector takes half a second to find what moves. With half of it a quarter of a second would be
+/// left to recognise it.
 const STARE_S: f64 = 1.5;
-/// Spacing of the views of a search along the cue's error ellipse, as a fraction of the view.
+/// Spacing of the views of a search along the cue's error ellipse, as a fraction of the view. With
+/// half of it a search has twice as many views; with twice as much there are gaps between them.
 const STEP: f64 = 0.8;
 /// The search reaches this many SDs to both sides along the ellipse's long axis: 19 of 20 targets
-/// are there.
+/// are there. With half of it one in three would lie beyond.
 const SEARCHED_SDS: f64 = 2.0;
-/// Of a search that would need more views than this, only the nearest are looked at.
+/// Of a search that would need more views than this, only the nearest are looked at. With half as
+/// many a target farther along a long stripe is never looked at.
 const MOST_VIEWS: i32 = 40;
 /// A track not seen for this long is no longer a candidate, s: a detector misses one now and then.
+/// With half of it the count of its images begins anew after a gap of a third of a second.
 const MISSED_S: f64 = 0.5;
 /// A target found within this time is kept even if there is a cue of a surer target, s: time for a
-/// turn and a stare.
+/// turn and a stare. With half of it such a target would be left before the next view has been
+/// looked at.
 const FOUND_S: f64 = 4.0;
-/// Most cues, and most times per cue, that are accepted: a fusion centre sends no more.
+/// Most cues, and most times per cue, that are accepted: a fusion centre sends no more. With half
+/// of either the same.
 const MOST_CUES: usize = 64;
 const MOST_TIMES: usize = 16;
 
@@ -138,6 +149,7 @@ impl Seeker {
     /// A seeker for a camera on a mount, or for one that stands still.
     pub fn new(model: &CameraModel, mount: Option<PanTilt>, angle_sd_rad: f64) -> Self {
         let lens = model.intrinsics();
+        // Half view of a pinhole camera: tan a = (pixels / 2) / focal length.
         let half_view = |pixels: u32, focal: f64| (f64::from(pixels) / 2.0 / focal).atan();
         let half_view =
             half_view(lens.size.width, lens.fx).min(half_view(lens.size.height, lens.fy));

@@ -12,19 +12,25 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
 /// How long a command may take to end after it was asked to stop: people wait for it. By itself it
-/// takes [`LAST_WORDS`] plus half a second to leave the network.
+/// takes [`LAST_WORDS`] plus half a second to leave the network. With half of it commands would be
+/// abandoned before they have left the network.
 const GRACE: Duration = Duration::from_millis(1800);
-/// How long after the request to stop a command still accepts messages that are on their way.
+/// How long after the request to stop a command still accepts messages that are on their way. With
+/// half of it those that take longer than 0.35 s are lost.
 pub const LAST_WORDS: Duration = Duration::from_millis(700);
-/// How long after the request to stop it still handles accepted messages; the rest is counted.
+/// How long after the request to stop it still handles accepted messages; the rest is counted. With
+/// half of it, less than [`LAST_WORDS`], all that is queued then would be lost.
 pub const LAST_WORK: Duration = Duration::from_millis(1100);
-/// How long it tries to take leave of peers that do not answer.
+/// How long it tries to take leave of peers that do not answer. With half of it peers across a slow
+/// network learn of the end by silence alone.
 pub const LEAVE: Duration = Duration::from_millis(500);
-/// As [`LEAVE`], for a command that has come to its end by itself: nothing may be lost.
+/// As [`LEAVE`], for a command that has come to its end by itself: nothing may be lost. With half
+/// of it what a slow receiver has not taken in five seconds would be.
 pub const LONG_LEAVE: Duration = Duration::from_secs(10);
-/// How often it is checked whether the time is up.
+/// How often it is checked whether the time is up. With half of it the same.
 const POLL: Duration = Duration::from_millis(20);
-/// The commands run on a thread of their own, with the stack of a main thread.
+/// The commands run on a thread of their own, with the stack of a main thread. With half of it what
+/// runs on a main thread might overflow it.
 const STACK_BYTES: usize = 8 << 20;
 
 /// The signal state: the system has one handler per process.

@@ -7,7 +7,7 @@ use nalgebra::{Matrix6, Vector6};
 use crate::Estimate;
 
 /// A camera takes part in a track if it has given it a bearing within this time before the answer,
-/// s.
+/// s. With half of it a camera with two frames per second would drop out whenever it misses one.
 const LATELY_S: f64 = 1.0;
 
 /// Record of a run's `TrackFrame`s: the causal answer to "where was each track at time t".

@@ -3,7 +3,8 @@ use std::collections::BTreeMap;
 use crossfix_message::{BearingFrame, ImageTrackState, Timestamp};
 
 /// Two frames this many times farther apart than usual for their camera have missing frames between
-/// them.
+/// them. With half of it no frame would follow another; above 2 a single missing frame goes
+/// unnoticed.
 const GAP_INTERVALS: f64 = 1.7;
 
 /// Records which cameras saw something when. A track cannot be better than what was seen: real data

@@ -5,9 +5,11 @@ use std::collections::BTreeMap;
 use crossfix_message::Timestamp;
 use serde::Serialize;
 
-/// Two instants of a target that are farther apart than this belong to different stretches, s.
+/// Two instants of a target that are farther apart than this belong to different stretches, s. With
+/// half of it each instant of a truth that is given once a second would be a stretch of its own.
 const GAP_S: f64 = 1.0;
-/// A stretch that is shorter than this and without an answer does not count, s.
+/// A stretch that is shorter than this and without an answer does not count, s. With half of it a
+/// target that is asked for during half a second only would count as missed.
 const LEAST_S: f64 = 1.0;
 
 /// Times until a target was answered for, from the beginning of each stretch of instants at which

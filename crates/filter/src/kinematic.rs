@@ -100,9 +100,9 @@ impl KinematicState {
         Some((state, -(nis + normaliser) / 2.0))
     }
 
-    /// Forgets: position and velocity become independent, and the squares of the standard deviations
-    /// given are added to the variances of each axis, so that neither is known better than by these
-    /// (Kalinov 2019, eq. 8).
+    /// Forgets: position and velocity become independent, and the squares of the standard
+    /// deviations given are added to the variances of each axis, so that neither is known better
+    /// than by these (Kalinov 2019, eq. 8).
     pub fn reinitialise(&mut self, position_sd: f64, velocity_sd: f64) {
         let mut covariance = Matrix6::zeros();
         for (block, sd) in [(0, position_sd), (3, velocity_sd)] {

@@ -40,6 +40,7 @@ impl SmoothedResidual {
         if self.residuals.len() > self.window {
             self.residuals.pop_front();
         }
+        // White residuals have a mean of deviation 1 / sqrt(n): 0.81 is 2.3 of these for n = 8.
         let mean = self.residuals.iter().sum::<Vector3<f64>>() / self.residuals.len() as f64;
         let alarm = self.residuals.len() == self.window && mean.amax() > self.scale;
         if alarm {

@@ -127,6 +127,7 @@ impl MotionModels {
         if calm <= most || calm >= 1.0 {
             return weights;
         }
+        // What the calm models lose the others gain, in proportion: the sum stays 1.
         let (fewer, more) = (most / calm, (1.0 - most) / (1.0 - calm));
         let mut less = weights;
         for (weight, model) in less.iter_mut().zip(&self.models) {

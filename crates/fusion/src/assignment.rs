@@ -4,10 +4,13 @@ use std::collections::BTreeMap;
 
 use pathfinding::prelude::{Matrix, kuhn_munkres};
 
-/// Gains are quantised, as the solver needs totally ordered numbers: steps of a millionth.
+/// Gains are quantised, as the solver needs totally ordered numbers: steps of a millionth. With
+/// half of it the same: gains are logarithms of likelihoods, and a millionth decides nothing.
 const STEPS: f64 = 1e6;
 /// Most pairs (all rows times all columns) of a cluster that is solved as a whole; a larger one is
-/// cut greedily: time is bounded.
+/// cut greedily: time is bounded. With half of it one of more than 100 rows and as many columns,
+/// and not only of more than 141, is cut, and targets close together may get one another's
+/// bearings.
 const MAX_KNOT: usize = 40_000;
 
 /// A row and a column that may be paired, and the gain of that over leaving both alone.
@@ -88,6 +91,7 @@ fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
 }
 
 fn greedy(cluster: &[Pairing]) -> Vec<(usize, usize)> {
+    // Equal gains in the order of rows and columns: that of the candidates must decide nothing.
     let mut by_gain = cluster.to_vec();
     by_gain.sort_by(|a, b| {
         b.gain.total_cmp(&a.gain).then(a.row.cmp(&b.row)).then(a.column.cmp(&b.column))

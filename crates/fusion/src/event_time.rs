@@ -13,10 +13,13 @@ use stream::Stream;
 
 pub(crate) use queue::ReorderQueue;
 
-/// Most exposures that are remembered of those that were released: memory is bounded.
+/// Most exposures that are remembered of those that were released: memory is bounded. With half of
+/// it the same at the default lateness, within which 64 cameras of 60 Hz send 1920; beyond it what
+/// comes twice passes for late.
 const MAX_TAKEN: usize = 20_000;
 
-/// A camera that has been silent for this many times the lateness is not waited for.
+/// A camera that has been silent for this many times the lateness is not waited for. With half of
+/// it, a second by default, cameras that send less than a frame a second are not.
 const PATIENCES: f64 = 4.0;
 
 /// Of the time that one camera's clock alone says has gone by, this share is believed. With all of

@@ -11,7 +11,8 @@ use crate::cameras::{KnownCamera, Pointed, Rooted};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
 
-/// Most bearings that are read of one frame: no image has more, and memory is bounded.
+/// Most bearings that are read of one frame: no image has more, and memory is bounded. With half of
+/// it the same.
 const MAX_BEARINGS: usize = 10_000;
 
 /// One measured target in one exposure.

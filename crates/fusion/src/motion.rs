@@ -7,8 +7,11 @@ use crossfix_filter::{
 use crate::{ConfigError, Manoeuvres, Tracking};
 
 /// Standard deviation of a track's velocity after a manoeuvre that a detector saw, m/s per axis.
+/// With half of it a target of 15 m/s that turns back is four deviations off; with twice as much
+/// the track forgets its course at a false alarm.
 pub(crate) const REINITIALISED_VELOCITY_SD: f64 = 15.0;
-/// Standard deviation of its position by then, m per axis.
+/// Standard deviation of its position by then, m per axis. With half of it a track that has been
+/// led astray comes back later.
 pub(crate) const REINITIALISED_POSITION_SD: f64 = 1.0;
 
 /// The motion models of all tracks, and the detector that a new track gets.

@@ -160,6 +160,7 @@ impl BearingPrediction {
         let by = model.by_position();
         let steady = by * state.position_covariance() * by.transpose()
             + Matrix2::identity() * (moved / model.range).powi(2);
+        // One model without process noise: `moved` stands for the motion.
         let mut weights = [0.0; MAX_MODELS];
         weights[0] = 1.0;
         let none = Matrix2::zeros();

@@ -18,10 +18,12 @@ use crate::{Exposure, Tracking};
 /// log-likelihood ratio: a chance of 1 in 3000. Half of it would settle one re-acquisition in 50 on
 /// a stranger.
 pub(crate) const FOUND_AGAIN_MARGIN: f64 = 8.0;
-/// A leaf whose log-likelihood ratio falls to this is given up.
+/// A leaf whose log-likelihood ratio falls to this is given up. With half of it one miss ends a
+/// leaf of even odds; as it is, two do.
 const GIVEN_UP: f64 = -3.0;
 /// Most leaves of one track at a time, the best ones: memory is bounded however many strangers
-/// there are.
+/// there are. With half of it, where more of them cross the sight line, the target's own leaf may
+/// be dropped before it is sure.
 const MAX_LEAVES: usize = 4;
 
 /// A copy of the track that has used bearings of a second camera, with the log-likelihood ratio of

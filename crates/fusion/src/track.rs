@@ -31,7 +31,8 @@ use ties::Ties;
 
 /// A target that just two cameras see counts as placed if its position is known to this share of
 /// the range (root of the summed variances of the axes): nearly parallel lines of two different
-/// targets cross too.
+/// targets cross too. With half of it the lines of two cameras must cross at twice the angle, and
+/// targets that are far away are found later.
 const MAX_PAIR_SHARE: f64 = 0.03;
 /// Identity of a 3D track, unique across restarts: see [`crossfix_message::track_id`]. Displayed as
 /// the track's number within its run.

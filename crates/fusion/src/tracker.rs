@@ -20,13 +20,16 @@ use association::fitting;
 use crate::{Exposure, Sighting, Tracking};
 
 /// Gate for merging: two positions closer than this (squared Mahalanobis distance, three degrees of
-/// freedom, P = 0.99) are one target if one of the tracks is coasting.
+/// freedom, P = 0.99) are one target if one of the tracks is coasting. With half of it one such
+/// track in eight goes on beside the live one until it is lost.
 const MERGE_GATE: f64 = 11.34;
-/// Every track's state is published at least this often, s.
+/// Every track's state is published at least this often, s. With half of it a track that coasts
+/// makes twice as many messages; with twice as much, neighbouring centres take it for ended.
 const PUBLISHED_EVERY_S: f64 = 0.5;
-/// A track that two cameras alone see says how well poses are known from this age on, s: before, the
-/// two may see different things that pass each other, and would make room for more such tracks. With
-/// half of it they do; with twice as much two cameras take as much longer to show that they err.
+/// A track that two cameras alone see says how well poses are known from this age on, s: before,
+/// the two may see different things that pass each other, and would make room for more such tracks.
+/// With half of it they do; with twice as much two cameras take as much longer to show that they
+/// err.
 const OF_ONE_S: f64 = 5.0;
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -158,7 +161,8 @@ impl Tracker {
     }
 
     /// Compares an exposure of an excluded camera with the confirmed tracks that others see,
-    /// without updating any: returns what [`TrackerStep::fittings`] and [`TrackerStep::used`] would be.
+    /// without updating any: returns what [`TrackerStep::fittings`] and [`TrackerStep::used`] would
+    /// be.
     pub(crate) fn compare(
         &self,
         exposure: &Exposure,

@@ -15,25 +15,35 @@ use crate::spatial::TimedLine;
 use crate::{Exposure, Initiation, Sighting};
 
 /// How long there must have been no track before anything is said, s: a target is found within two.
+/// With half of it one that is found a little late is preceded by a warning.
 const PATIENCE_S: f64 = 5.0;
-/// How often two cameras are compared, s.
+/// How often two cameras are compared, s. With half of it the comparisons that count are those of
+/// 2.5 s.
 const INTERVAL_S: f64 = 0.25;
-/// How often a conclusion is drawn, s: counting costs more than comparing.
+/// How often a conclusion is drawn, s: counting costs more than comparing. With half of it the
+/// reason is known up to half a second sooner, at twice the cost.
 const CONCLUDED_EVERY_S: f64 = 1.0;
-/// Number of comparisons of two cameras that count: those of the last five seconds.
+/// Number of comparisons of two cameras that count: those of the last five seconds. With half of it
+/// a bird that passes decides what is said.
 const REMEMBERED: usize = 20;
-/// Share of these comparisons in which both cameras must have seen something.
+/// Share of these comparisons in which both cameras must have seen something. With half of it
+/// clutter that both see now and then counts as a target that is not found.
 const LEAST_SHARE: f64 = 0.8;
 /// What an agent has followed in its image for this long is something, s: clutter comes and goes.
+/// With half of it more of that is compared, and lines of clutter miss each other.
 const SOMETHING_S: f64 = 1.0;
-/// Exposures further apart than this are not compared, s.
+/// Exposures further apart than this are not compared, s. With half of it cameras of 1 Hz are
+/// seldom compared; with twice as much, what a target may fly in between hides what is wrong.
 const MAX_APART_S: f64 = 0.5;
 /// Cameras that are nearer to each other than this stand in the same place, m: what they see has no
-/// range. No survey is as good; a pose that was copied is the same to the last digit.
+/// range. No survey is as good; a pose that was copied is the same to the last digit. With half of
+/// it the same.
 const SAME_PLACE_M: f64 = 1e-3;
-/// Most lines of one exposure that are compared: time is bounded.
+/// Most lines of one exposure that are compared: time is bounded. With half of it the one target
+/// among twenty image tracks may not be compared.
 const MAX_LINES: usize = 30;
-/// Most image tracks of a camera that are remembered: memory is bounded.
+/// Most image tracks of a camera that are remembered: memory is bounded. Beyond it new ones are not
+/// looked at until old ones have gone.
 const MAX_IMAGE_TRACKS: usize = 1_000;
 
 /// Why no target is found.

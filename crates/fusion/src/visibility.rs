@@ -2,7 +2,8 @@
 
 use crossfix_message::Timestamp;
 
-/// Typical time for which an obstacle hides a target from cameras, s.
+/// Typical time for which an obstacle hides a target from cameras, s. With half of it a camera
+/// behind a tree speaks against a target twice as fast; with twice as much, ghosts live longer.
 const HIDDEN_S: f64 = 0.25;
 
 /// Weight of a piece of evidence that follows another of the same target after `interval_s`
@@ -15,7 +16,9 @@ pub(crate) fn independent_share(interval_s: f64) -> f64 {
 /// which a camera's bearing holds (supports) a track: once in twenty seconds. With half of it a
 /// camera that is blind for a target costs its track too much.
 const HIDDEN: f64 = 0.075;
-/// Rate at which a hidden target comes into sight again, per the same time: every two seconds.
+/// Rate at which a hidden target comes into sight again, per the same time: every two seconds. With
+/// half of it a target of which nothing is known is visible with 0.83 and not 0.91, and a miss says
+/// less against a ghost.
 const APPEARS: f64 = 0.75;
 
 /// Log-likelihood ratio of a missed report, for a target that the camera can see with probability

@@ -9,7 +9,7 @@ const FLATTENING: f64 = 1.0 / 298.257_223_563;
 /// Square of the first eccentricity of the WGS84 ellipsoid, e^2 = f (2 - f).
 const ECCENTRICITY_SQUARED: f64 = FLATTENING * (2.0 - FLATTENING);
 /// Steps of the latitude's iteration: each reduces the error by a factor of 200, and the first
-/// leaves 1e-5.
+/// leaves 1e-5. With half of it 1.6 mm would be left.
 const LATITUDE_STEPS: usize = 6;
 
 /// A place on or above the Earth: WGS84, with the height above the ellipsoid.

@@ -13,10 +13,10 @@ use crate::{
 };
 
 /// Largest standard deviation of a pose's rotation about an axis, rad: beyond this the pose counts
-/// as unknown.
+/// as unknown. With half of it a pose known to 30 degrees would be refused; it helps as little.
 pub const MOST_ROTATION_SD: f64 = 1.0;
 /// Largest standard deviation of a pose's position along an axis, m: some sites are smaller than
-/// this.
+/// this. With half of it a pose that is of use to a site of some kilometres might be refused.
 pub const MOST_POSITION_SD: f64 = 1000.0;
 
 /// A [`CameraCalibration`] that has been parsed and found possible.

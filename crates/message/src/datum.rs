@@ -6,7 +6,7 @@ use crate::covariance::is_covariance;
 use crate::{SiteDatum, Timestamp};
 
 /// Largest standard deviation that is accepted (m, rad, s, ratios); anything larger is not known at
-/// all: the Earth is as large in metres.
+/// all: the Earth is as large in metres. With half of it the same.
 const LARGEST_SD: f64 = 1e7;
 
 /// Uncertainty of a site as a whole: errors that all its places and times have in common.

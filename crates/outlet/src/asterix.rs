@@ -16,7 +16,8 @@ const RECORD_BYTES: usize = 42;
 /// Most records of a block, so that it fits into one datagram of an ordinary network.
 const MOST_RECORDS: usize = (1400 - HEAD_BYTES) / RECORD_BYTES;
 /// A track number is reused only this long after its track was lost, s: displays have forgotten it
-/// by then.
+/// by then. With half of it a display that keeps a track for longer than 30 s joins two targets
+/// into one.
 const NUMBER_RESTS_S: f64 = 60.0;
 
 /// Resolution of the items: the value of their last bits.
@@ -135,6 +136,7 @@ fn accuracies(target: &Target) -> Vec<u8> {
     /// Present: rate of climb (ARC).
     const SECOND: u8 = 0x80;
     let (place, velocity) = (target.place_sd_m(), target.velocity_sd_mps());
+    // A degree of longitude is shorter by the cosine of the latitude.
     let parallel_m = DEGREE_M * target.place.latitude().cos().max(f64::EPSILON);
     let mut bytes = vec![FIRST, SECOND];
     bytes.extend(deviation::<2>(place.y / DEGREE_M, DEGREE_LSB));

@@ -14,8 +14,8 @@
 //!
 //! [`foxglove`] writes Foxglove's well-known schemas beside our own messages.
 //!
-//! The datum is WGS84 (G2139 or whatever the anchor was measured in), heights are above the ellipsoid;
-//! where a format wants another height, its outlet says so.
+//! The datum is WGS84 (G2139 or whatever the anchor was measured in), heights are above the
+//! ellipsoid; where a format wants another height, its outlet says so.
 //!
 //! ```
 //! use crossfix_geometry::Geodetic;

@@ -14,9 +14,11 @@ use crate::Target;
 /// A track of which nothing was heard for this long is lost, s: a fusion centre sends each of its
 /// tracks at least every half second. With half of it, tracks are lost on a link that stutters.
 const SILENCE_S: f64 = 2.0;
-/// Most tracks that are kept; a fusion centre has a thousand at most.
+/// Most tracks that are kept; a fusion centre has a thousand at most. With half of it those of five
+/// full fusion centres fit, and new tracks beyond them are left out.
 const MOST_TRACKS: usize = 10_000;
-/// Most fusion centres whose time is kept.
+/// Most fusion centres whose time is kept. The tracks of one more are kept, but its restart is not
+/// noticed; with half of it, from the 501st on.
 const MOST_CENTRES: usize = 1000;
 
 /// Where all targets are at one instant.

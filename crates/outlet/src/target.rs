@@ -42,7 +42,7 @@ pub struct Motion {
     pub slope_deg: Uncertain,
 }
 
-/// Least speed that is divided by, m/s: below it there is no direction.
+/// Least speed that is divided by, m/s: below it there is no direction. With half of it the same.
 const SLOWEST_MPS: f64 = 1e-6;
 
 impl Target {

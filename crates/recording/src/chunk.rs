@@ -10,14 +10,16 @@ use mcap::{McapError, McapResult};
 pub(crate) const HEAD_BYTES: usize = 9;
 /// Longest record that is read, bytes; a longer one is skipped, and a chunk that claims to hold
 /// more is not unpacked. The writer closes a chunk at half a megabyte and takes no message above 8
-/// MB, so its own records are shorter.
+/// MB, so its own records are shorter. With half of it the same, but that chunks of other programs
+/// are left out from 32 MB on.
 pub(crate) const MAX_RECORD_BYTES: u64 = 64 << 20;
 /// Bytes at the beginning of a chunk by which it is recognised: record head, first and last time,
 /// unpacked size, checksum, the compression's name with its length before it, and the packed size.
 pub(crate) const LOOKS_BYTES: usize = HEAD_BYTES + 8 + 8 + 8 + 4 + 4 + COMPRESSION.len() + 8;
 /// The only compression that Crossfix writes.
 const COMPRESSION: &[u8] = b"zstd";
-/// The longest compression name that is accepted, bytes: the format has `zstd` and `lz4`.
+/// The longest compression name that is accepted, bytes: the format has `zstd` and `lz4`. With half
+/// of it the same.
 const LONGEST_NAME: usize = 32;
 /// Bytes of a chunk's body before its packed records.
 const FIXED_BYTES: u64 = (LOOKS_BYTES - HEAD_BYTES) as u64;

@@ -13,7 +13,8 @@ use crate::source::{self, Texts};
 use crate::{CHANNELS, Damage, Entry, RecordingError, Source};
 
 /// Damaged records may claim bytes that belong to other records, so that these bytes are read
-/// again: in total at most this many times the size of the file.
+/// again: in total at most this many times the size of the file. With half of it the rest of a
+/// badly damaged file is given up sooner; with twice as much a hostile one takes twice as long.
 const MOST_READINGS: u64 = 16;
 
 /// Result of reading a recording: what it held, and what could not be read.
@@ -386,6 +387,7 @@ impl<R: Read + Seek> RecordingReader<R> {
 
     /// The place of the first chunk at or after a place.
     fn find_chunk(&mut self, from: u64) -> Result<Option<u64>, RecordingError> {
+        /// Bytes that are searched at a time: with half of it the same.
         const WINDOW: usize = 1 << 20;
         let mut window = vec![0; WINDOW + chunk::LOOKS_BYTES];
         let mut at = from;

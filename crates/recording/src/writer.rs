@@ -12,7 +12,9 @@ use crate::{Beside, CHANNELS, Entry, RecordingError, Source, schema_of};
 /// The fastest compression: recordings are mostly floating-point numbers, which higher levels
 /// hardly make smaller.
 const COMPRESSION_LEVEL: u32 = 1;
-/// Uncompressed size at which a chunk is closed: small enough that a crash loses little.
+/// Uncompressed size at which a chunk is closed: small enough that a crash loses little. With half
+/// of it chunks are twice as many, and each is compressed alone; with twice as much a damaged byte
+/// costs twice as many messages.
 const CHUNK_BYTES: u64 = 512 * 1024;
 
 /// Header of a channel's message with this sequence number. MCAP has no time before the epoch:

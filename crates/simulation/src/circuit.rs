@@ -5,11 +5,16 @@ use std::f64::consts::{FRAC_PI_4, PI, TAU};
 use nalgebra::{Point3, Vector2, Vector3};
 use rand::{Rng, RngExt};
 
-/// Duration of one arc, after which a target decides again how to go on, s.
+/// Duration of one arc, after which a target decides again how to go on, s. With half of it twice
+/// as many arcs are kept; with twice as much, a target at 20 m/s flies up to 20 m beyond the inner
+/// border before it turns back.
 const LEG_S: f64 = 0.5;
-/// Mean time after which a gently turning target chooses another rate of turn, s.
+/// Mean time after which a gently turning target chooses another rate of turn, s. With half of it
+/// flights change their turn twice as often, which filters follow less well.
 const MOOD_S: f64 = 10.0;
-/// Lowest rate of turn at which a target turns back at the border, rad/s.
+/// Lowest rate of turn at which a target turns back at the border, rad/s. With half of it a target
+/// at 20 m/s turns within 200 m, so that the inner border of the default site lies 90 m and not 190
+/// m from the middle.
 const LEAST_TURN_BACK: f64 = 0.2;
 
 /// The volume that targets stay within, and how they fly in it.

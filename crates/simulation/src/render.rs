@@ -1,11 +1,14 @@
 //! Drawing a target into an image: a dark silhouette with soft edges, smeared
 //! along its motion during the exposure.
 
-/// Difference of brightness between the sky and a target, 8-bit levels.
+/// Difference of brightness between the sky and a target, 8-bit levels. With half of it targets are
+/// no darker than clouds may be, 43 levels; twice as much is more than the darkest sky has.
 const DARKNESS: f32 = 85.0;
-/// Number of copies of a target that make up its motion blur.
+/// Number of copies of a target that make up its motion blur. Three show separately where a target
+/// moves by more than three of its spans during the exposure; one would be no blur.
 const SMEAR_STEPS: usize = 3;
-/// Number of sub-samples per pixel and axis.
+/// Number of sub-samples per pixel and axis. With half of it a copy covers a pixel in steps of a
+/// quarter instead of a sixteenth, and small targets flicker as they move.
 const SUPERSAMPLING: usize = 4;
 
 /// A frame as a camera of the scene delivers it.
@@ -50,6 +53,7 @@ fn silhouette(u: f64, v: f64) -> bool {
 pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &RenderedTarget) {
     let half = target.span / 2.0;
     let soft = target.blur.max(0.3);
+    // The blur's outer nodes lie at 1.7 deviations: nothing is covered beyond this.
     let reach = half + 3.0 * soft + 1.0;
     let [low_x, high_x] =
         [target.from[0].min(target.to[0]) - reach, target.from[0].max(target.to[0]) + reach];

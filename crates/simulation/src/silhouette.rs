@@ -1,13 +1,18 @@
 //! Drone silhouettes with the sizes, contrasts and energies of Lytvynets 2020, table 1, drawn at
 //! any place, size and angle.
 
-/// Number of sub-samples per pixel and axis.
+/// Number of sub-samples per pixel and axis. With half of it the arm of the smallest silhouette,
+/// 0.9 px thick, has fewer than four samples across.
 const SUPERSAMPLING: usize = 8;
-/// Standard deviation of the blur, px.
+/// Standard deviation of the blur, px. With half of it edges are much finer than a pixel, and fits
+/// are pulled towards whole pixels.
 const BLUR: f64 = 0.35;
-/// Margin around the box, pixels, into which blur and turn reach.
+/// Margin around the box, pixels, into which blur and turn reach. The blurred pixel reaches 1.9 px,
+/// so half of it just suffices.
 const MARGIN: f64 = 4.0;
-/// Half side of the silhouette as a share of the box' full side.
+/// Half side of the silhouette as a share of the box' full side. At a half the silhouette touches
+/// the box; with half of it, it has a quarter of the area, and needs a far higher contrast for the
+/// table's deviation.
 const FILL: f64 = 0.47;
 
 /// The sizes of Herasymenko 2021, Fig. 3 and Lytvynets 2020, Fig. 6.1.
@@ -193,6 +198,8 @@ fn filtered(samples: &[f32], columns: usize, kernel: &[f64]) -> Vec<f32> {
                     let at = index(i);
                     let mut value = 0.0;
                     for (k, tap) in kernel.iter().enumerate() {
+                        // Tap k takes the sample k - half steps on, if that is in the same row or
+                        // column.
                         let there = at + k;
                         if there >= half && there - half < count {
                             value += tap

@@ -20,9 +20,12 @@ use crate::circuit::{Airspace, Circuit};
 use crate::{SceneError, TargetState};
 
 /// Track numbers per exposure: the bearings of an exposure are numbered from its sequence number
-/// times this.
+/// times this. An exposure with more bearings than this uses numbers of the next one; with half of
+/// it, from 32 769 on.
 const NUMBERS_PER_EXPOSURE: u64 = 1 << 16;
-/// Height of the lowest cameras above the ground, m; others stand at two and three times this.
+/// Height of the lowest cameras above the ground, m; others stand at two and three times this. With
+/// half of it the heights differ by 4 m and not by 8, and the cameras are nearer to one plane,
+/// which is poorly observable.
 const MAST_M: f64 = 4.0;
 
 /// Arrangement of the cameras of a site.
@@ -337,6 +340,7 @@ impl SimulatedSite {
                 let deviation: f64 = StandardNormal.sample(rng);
                 noise_rad * deviation
             });
+            // u + E n, scaled to length 1, with the noise n on the tangents E of the direction u.
             let measured = Unit::new_normalize(exact.into_inner() + tangent_basis(&exact) * noise);
             found.push((measured, Some(target.id)));
         }

@@ -5,13 +5,17 @@ use rand_chacha::ChaCha8Rng;
 
 /// Brightness at the lower (horizon) and the upper (zenith) edge of the image, 8-bit levels.
 const GRADIENT: [f32; 2] = [190.0, 130.0];
-/// Amplitude of the coarsest clouds, 8-bit levels; each finer octave has half of it.
+/// Amplitude of the coarsest clouds, 8-bit levels; each finer octave has half of it. All octaves
+/// together reach 43; with twice as much clouds could be as dark as targets, with half of it they
+/// are easily told from them.
 const CLOUDS: f32 = 22.0;
-/// Size of the coarsest clouds, pixels.
+/// Size of the coarsest clouds, pixels, and number of octaves: the finest are of 10 pixels, as
+/// small as targets. With half of the octaves none is smaller than 40.
 const COARSEST: usize = 160;
 const OCTAVES: u32 = 5;
 
-/// Period of a panorama's clouds in knots, in every octave: after this many the clouds repeat.
+/// Period of a panorama's clouds in knots, in every octave: after this many the clouds repeat. With
+/// half of it the finest clouds repeat every 320 pixels and not every 640.
 const PERIOD: usize = 64;
 
 /// A sky of `width` by `height` pixels, row by row.
@@ -20,6 +24,7 @@ pub(crate) fn sky(width: usize, height: usize, seed: u64) -> Vec<f32> {
     let mut samples = gradient(width, height);
     for octave in 0..OCTAVES {
         let (cell, strength) = cell_and_strength(octave);
+        // Value noise: random values at knots a cell apart, interpolated in between.
         let columns = width / cell + 2;
         let knots: Vec<f32> =
             (0..columns * (height / cell + 2)).map(|_| rng.random::<f32>() * 2.0 - 1.0).collect();

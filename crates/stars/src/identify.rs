@@ -18,29 +18,37 @@ pub struct NamedStar {
     pub direction: Unit<Vector3<f64>>,
 }
 
-/// Least number of spots: with fewer no pattern with a star to spare can be made.
+/// Least number of spots: with fewer no pattern with a star to spare can be made. With half of it
+/// such a picture is searched in vain, and its error asks about the lens.
 const FEWEST_SPOTS: usize = 5;
 /// Largest error of the focal length in a lens file, as a share: zooms that are not touched keep it
-/// to 2 %.
+/// to 2 %. With half of it such zooms lie at the end of the search, and those beyond are not named.
 const SCALE_SHARE: f64 = 0.04;
 /// Number of the brightest spots that patterns are made of: planets, lamps and aircraft are among
-/// them.
+/// them. With half of it four lamps spoil three of four patterns; of 32 spots they spoil two of
+/// five.
 const PATTERN_SPOTS: u32 = 32;
 /// A star is matched to a spot within this share of the image's width of where the pattern puts the
-/// star.
+/// star. With half of it stars near the image's sides, where a lens file errs most, are left over
+/// and count against a right answer.
 const MATCH_SHARE: f32 = 0.01;
-/// Sine of the least elevation (3 degrees): below it refraction is not known well enough.
+/// Sine of the least elevation (3 degrees): below it refraction is not known well enough. With half
+/// of it stars at 1.4 degrees are used, but their refraction is stated as if they stood at 3.
 const LOWEST_SINE: f64 = 0.05;
-/// Stars below this sine of the elevation have set, whatever the refraction, ...
+/// Stars below this sine of the elevation have set, whatever the refraction (at the horizon it is
+/// half of this, with which a star that is just seen may count), ...
 const SET_SINE: f64 = -0.02;
 /// ... and if more than this share of the named stars has set, the time or the place is wrong: one
-/// name in twenty may be wrong.
+/// name in twenty may be wrong. With half of it such names alone may have a good picture refused.
 const MOST_SET: f64 = 0.1;
 /// Of two stars near a spot the brighter one is taken if the other is fainter by more than this, in
-/// magnitudes.
+/// magnitudes. With half of it the brighter need only shine 2.5 times as much, and the spot may be
+/// of the other one.
 const OUTSHONE: f64 = 2.0;
 /// Where stars are named by a pose and lens, those fainter by more than this many magnitudes than
-/// the faintest that must be visible are not considered: a spot there is noise.
+/// the faintest that must be visible are not considered: a spot there is noise. With half of it
+/// stars that are brighter to the camera than in the catalogue's colour are left out; with twice as
+/// much, noise is named after stars near it.
 const FAINTER: f64 = 1.0;
 
 impl Sky {

@@ -26,14 +26,16 @@ const TEMPERATURE_C: f64 = 10.0;
 const HUMIDITY: f64 = 0.5;
 const WAVELENGTH_UM: f64 = 0.6;
 /// Relative standard deviation of refraction, as the weather is not known: 15 degrees of
-/// temperature and 20 hPa, each a standard deviation.
+/// temperature and 20 hPa, each a standard deviation. With half of it low stars weigh up to four
+/// times as much, and the weather tilts cameras by more than they state.
 const REFRACTION_SHARE: f64 = 0.05;
 
 /// UT1, by which the Earth turns, was within 0.3 s of UTC in these years, ...
 const QUIET_YEARS: std::ops::Range<f64> = 2017.0..2028.0;
 const QUIET_EARTH_SD_S: f64 = 0.15;
 /// ... and is kept within 0.9 s of it. The difference on a given day is in no file here. Standard
-/// deviations, s.
+/// deviations, s. With half of them these bounds are four deviations and more, and cameras may be
+/// turned by more than they state.
 const EARTH_SD_S: f64 = 0.4;
 /// The Earth's rate against the stars, rad/s.
 const EARTH_RATE: f64 = 7.292_115e-5;
@@ -120,7 +122,8 @@ impl Observer {
 /// of arc.
 const REFRACTION_RAD: f64 = 2.9e-4;
 /// Standard deviation of a star's catalogued direction, rad. Catalogues are better than this;
-/// double stars, and what has moved beside them, are good to 2 seconds of arc.
+/// double stars, and what has moved beside them, are good to 2 seconds of arc. With half of it the
+/// same but for long lenses: of 1400 pixels' focal length it is 0.014 pixels.
 const STAR_SD_RAD: f64 = 1e-5;
 
 /// Standard deviation of a star's elevation due to the unknown weather, rad.

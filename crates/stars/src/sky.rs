@@ -28,17 +28,23 @@ pub struct Sky {
 }
 
 /// Range of image widths that are used for patterns, degrees: patterns outside this part of a wide
-/// image are not searched; stars there are named afterwards.
+/// image are not searched; stars there are named afterwards. With half of the upper end a quarter
+/// of a wide image's spots are left for patterns; with half of the lower one a lens of 2 degrees
+/// takes four times the memory of one of 4.
 const WIDTHS_DEG: std::ops::RangeInclusive<f64> = 4.0..=100.0;
 /// Error of a pattern's sides, as a share of the longest: lens files are off by 2 % in scale, which
-/// cancels, and by less in shape.
+/// cancels, and by less in shape. With half of it pictures whose lens bends by as much otherwise
+/// than its file says are not named.
 const PATTERN_SHARE: f32 = 0.003;
-/// Number of places per image that the sky is divided into, at which patterns are made, ...
+/// Number of places per image that the sky is divided into, at which patterns are made (with half
+/// of it there are fewer patterns, and more pictures show none of them), ...
 const OVERSAMPLING: f64 = 100.0;
 /// ... and the width, in degrees, below which it is reduced to at least [`LEAST_OVERSAMPLING`], as
 /// the sky has more images of a narrow lens: with as many places, patterns of a lens of 5 degrees
 /// would take gigabytes.
 const WIDE_DEG: f64 = 20.0;
+/// With half of it a lens of 4 degrees has a third fewer places, and more of its pictures are not
+/// named.
 const LEAST_OVERSAMPLING: f64 = 6.0;
 /// Patterns per part of the sky: with the library's 50 one picture in five was not named where a
 /// fifth of the spots are not stars and a seventh of the stars are hidden; with 400 one in thirty.
@@ -59,6 +65,7 @@ impl Sky {
             |why: String| StarError::Catalogue { path: catalogue.display().to_string(), why };
         let prepared = observer.prepare()?;
         let width_deg = pattern_width(lens).to_degrees();
+        // Images that cover the sky grow in number with 1 / width^2, which this balances.
         let narrowness = (width_deg / WIDE_DEG).powi(2).min(1.0);
         let oversampling = (OVERSAMPLING * narrowness).max(LEAST_OVERSAMPLING);
         let config = GenerateDatabaseConfig {

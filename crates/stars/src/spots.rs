@@ -25,7 +25,8 @@ pub struct Spot {
     pub brightness: f64,
 }
 
-/// Largest number of spots: more are lights of a town, or noise; the brightest are kept.
+/// Largest number of spots: more are lights of a town, or noise; the brightest are kept. With half
+/// of it a wide picture of a dark sky determines its lens by half as many stars.
 const MOST_SPOTS: usize = 600;
 
 /// Finds what looks like a star: small, round, brighter than its surroundings. Brightest first.

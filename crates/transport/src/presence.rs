@@ -5,7 +5,7 @@ use crossfix_message::Key;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::SampleKind;
 
-/// Most components that are tracked; more is an attack.
+/// Most components that are tracked; more is an attack. With half of it the same.
 const MAX_COMPONENTS: usize = 10_000;
 
 /// The components of a site that are alive: they have declared it and have not been lost since.

@@ -5,14 +5,17 @@ use crossfix_message::Key;
 
 use crate::{Origin, RunId};
 
-/// Most runs remembered per key: the one that publishes, and those before it.
+/// Most runs remembered per key: the one that publishes, and those before it. With half of it three
+/// that take turns would each be forgotten before they come again, and never count as rivals.
 const RUNS_A_KEY: usize = 4;
-/// Most keys that are counted. A site of 1000 cameras has 5000; more is an attack.
+/// Most keys that are counted. A site of 1000 cameras has 5000; more is an attack. With half of it
+/// such a site just fits.
 const MAX_KEYS: usize = 10_000;
 /// A larger gap is not counted as a loss: the number makes no sense. This is three hours of 100
-/// messages per second.
+/// messages per second. With half of it the loss of an hour and a half at that rate is not counted.
 const LARGEST_GAP: u64 = 1_000_000;
-/// Two runs that took turns on a key less than this ago still count as rivals.
+/// Two runs that took turns on a key less than this ago still count as rivals. With half of it a
+/// warning about two that take turns every six seconds comes and goes.
 const RIVALRY: Duration = Duration::from_secs(10);
 
 /// Counts the messages of each key that did not arrive, and notices two publishers on one key.

@@ -11,7 +11,8 @@ use crate::{LinkError, Mode, NetworkConfig, NetworkError, Role};
 /// next: 1 MB, the most that Zenoh takes. With half of it, a good receiver loses part of a burst of
 /// a thousand tracks.
 const QUEUED_BATCHES: u32 = 16;
-/// The same for pictures, so that what a slow receiver sees is at most this much old.
+/// The same for pictures, so that what a slow receiver sees is at most this much old. With half of
+/// it only one preview of 100 kB waits, and the next is lost.
 const PICTURE_BATCHES: u32 = 4;
 /// Bytes that the operating system holds for one receiver besides that. Its own default is four
 /// megabytes: then a receiver behind 5 kB per second would get tracks a quarter of an hour old
@@ -21,7 +22,9 @@ const SEND_BUFFER_BYTES: u32 = 256 << 10;
 /// seconds. A program that waits for a router that does not answer at all can report that within
 /// five seconds.
 const OPEN_TIMEOUT_MS: u32 = 4000;
-/// A peer that has not been heard for this long is taken as gone, ms.
+/// A peer that has not been heard for this long is taken as gone, ms. With half of it a wireless
+/// link that stalls for two seconds ends the session; with twice as much a peer that is gone counts
+/// as there for six.
 const LEASE_MS: u32 = 3000;
 
 /// Zenoh's settings by which this component shows its identity, and accepts from others only what

@@ -10,7 +10,8 @@ use zenoh::sample::{Sample, SampleKind};
 use crate::Origin;
 
 /// Messages, and their bytes, that may wait for the program before new ones are dropped and
-/// counted: two minutes of a site of 16 cameras at 30 Hz, half as many pictures.
+/// counted: two minutes of a site of 16 cameras at 30 Hz, half as many pictures. With half of them
+/// messages are lost where a program stops for longer than one minute.
 const MAX_WAITING: usize = 1 << 16;
 const MAX_WAITING_BYTES: usize = 64 << 20;
 

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use crate::{CaptureTime, Frame, FrameClock, FrameSource, VideoError, decode_still};
 
-/// The longest frame that is read, bytes: no JPEG picture of the largest image is longer.
+/// The longest frame that is read, bytes: no JPEG picture of the largest image is longer. With half
+/// of it the same for pictures of cameras.
 const MOST_BYTES: u64 = 1 << 28;
 /// Codecs in which every frame is a JPEG picture.
 const MOTION_JPEG: [&[u8; 4]; 4] = [b"MJPG", b"mjpg", b"AVI1", b"JPEG"];
@@ -104,6 +105,7 @@ impl AviSource {
                 b"strh" => {
                     let head = chunks.read(size, 64).map_err(open)?;
                     is_video = head.starts_with(b"vids");
+                    // Frames per second are the head's rate over its scale.
                     rate_hz = f64::from(number(&head, 24)) / f64::from(number(&head, 20).max(1));
                     streams = streams.saturating_add(1);
                 }

@@ -14,7 +14,8 @@ use openh264::formats::{YUVSlices, YUVSource};
 use crate::annex_b::units;
 use crate::{MAX_PIXELS, Pixels};
 
-/// Most units whose pictures are waited for: no decoder holds back more, H.264 allows 16.
+/// Most units whose pictures are waited for: no decoder holds back more, H.264 allows 16. With half
+/// of it every picture of a stream that holds back 16 would have its successor's time.
 const MOST_PENDING: usize = 32;
 
 /// The brightness of a decoded picture, row by row.
@@ -217,6 +218,8 @@ impl H264Encoder {
 /// # Errors
 /// What encoder or decoder say.
 pub fn decoding_time(width: usize, height: usize) -> Result<Duration, String> {
+    /// Number of pictures: with half of it the median is of six, and one that the host delays
+    /// counts more.
     const PICTURES: usize = 12;
     let (mut encoder, mut decoder) =
         (H264Encoder::new(PICTURES as f64)?, H264Decoder::of_stream()?);

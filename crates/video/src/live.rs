@@ -9,25 +9,32 @@ use crate::{Frame, FrameSource, Losses, VideoError};
 /// only busy; with twice as much, a target at 30 m/s flies on for 120 m unseen.
 pub(crate) const SILENCE: Duration = Duration::from_secs(2);
 /// Upper limit of the allowed silence: cameras that send a frame in half a minute are of no use
-/// here.
+/// here. With half of it those that send one in 16 s or more are reopened for ever.
 const LONGEST_SILENCE: Duration = Duration::from_secs(32);
 /// Pause before a camera is reopened for the first time; each pause is twice the one before, up to
 /// the longest. A camera that restarts takes half a minute, and should not be asked all the time.
+/// With twice the longest, a camera that is back stays unseen for up to 16 s; with half of it, one
+/// that is gone is asked twice as often.
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 /// A camera that broke off after less than this is not steady: its pauses go on growing as if it
-/// had never been there.
+/// had never been there. With half of it one that breaks off every three seconds is asked again
+/// after half a second each time.
 const STEADY: Duration = Duration::from_secs(5);
 /// Pause before a camera that refused is asked again: many makes lock out a client that tries a
-/// wrong password too often.
+/// wrong password too often. With half of it tries are twice as many; with twice as much a
+/// corrected password takes up to two minutes to be believed.
 const REFUSED_PAUSE: Duration = Duration::from_secs(60);
 /// How long dropping a [`Live`] waits for the session with the camera to be closed: an interval
-/// between two frames, and the farewell.
+/// between two frames, and the farewell. With half of it a farewell that takes its full 200 ms
+/// leaves no time for the frame, and a session may stay open in the camera.
 const LEAVE: Duration = Duration::from_millis(400);
 /// Frames that may wait to be taken; if there are more, the oldest is discarded. One that has
-/// waited longer is of no use for where something is now.
+/// waited longer is of no use for where something is now. With half of it a program that stops for
+/// three frames loses one; with twice as much frames may be a quarter of a second old at 30 Hz.
 const WAITING: usize = 4;
-/// Troubles that may wait to be taken.
+/// Troubles that may wait to be taken. With half of it the same: what comes beyond is dropped, and
+/// the first ones say why.
 const TROUBLES: usize = 64;
 
 /// What a live camera shows at the moment.

@@ -12,12 +12,16 @@ use crate::{CaptureTime, Latency, TimedBy};
 pub(crate) const NTP_TO_UNIX_S: u64 = 2_208_988_800;
 /// How long a sender report is used to estimate the camera's clock, s. Reports come every five
 /// seconds or so and each may be some milliseconds off; over a minute a quartz clock's drift is a
-/// straight line.
+/// straight line. With half of it the line has half of the reports and of their span, and its slope
+/// errs by 2.8 times as much.
 const REPORTS_S: f64 = 60.0;
 /// Most reports that are kept: no camera sends more in a minute, and each costs work per image.
+/// With half of it a camera that is asked every second would be known by half a minute of answers.
 const MOST_REPORTS: usize = 64;
 /// A clock that differs by more than this from what its reports predicted was set, s: more than a
-/// busy camera is late in reporting, and more than a quartz drifts between two reports.
+/// busy camera is late in reporting, and more than a quartz drifts between two reports. With half
+/// of it a report that is late by 0.2 s would discard all before it; with twice as much a clock
+/// that was set by 0.4 s is followed late.
 pub(crate) const SET_S: f64 = 0.25;
 /// If the camera's clock differs from the host's by more than this, one of them is not on UTC, s. A
 /// network that stalls holds frames for as long; half of it would refuse cameras on bad networks.
@@ -33,11 +37,13 @@ const ASKED_LEVEL_S: f64 = 2.0;
 /// camera.
 const ARRIVALS_S: f64 = 30.0;
 /// After a stream broke off, what was known of the camera's clock relative to the host's is used
-/// for this long, s: two quartz clocks drift apart by 30 ms in it.
+/// for this long, s: two quartz clocks drift apart by 30 ms in it. With half of it a camera that
+/// comes back after six minutes is timed by its arrivals until its first report.
 const REMEMBERED_S: f64 = 600.0;
 
 /// Standard deviation of capture times that come from the remembered clock, s: the first frames of
 /// a stream arrive as late as the quickest before them, or later by what a camera takes to start.
+/// With half of it such times would seem better known than they are.
 const REMEMBERED_SD_S: f64 = 0.1;
 
 /// A camera's clock, estimated from its latest reports.

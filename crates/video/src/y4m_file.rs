@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::{Frame, FrameClock, FrameSource, MAX_PIXELS, Pixels, VideoError};
 
-/// The longest header line that is read, bytes.
+/// The longest header line that is read, bytes. With half of it the same.
 const MAX_HEADER: u64 = 4096;
 
 type Input = Chain<Cursor<Vec<u8>>, Counted>;

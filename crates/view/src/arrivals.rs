@@ -3,7 +3,8 @@ use std::collections::BTreeMap;
 use crossfix_message::Timestamp;
 
 /// Frames per camera whose arrival is remembered: half a minute at 30 per second; the tracks follow
-/// within that time.
+/// within that time. With half of it tracks that follow after more than 16 s at that rate have no
+/// latency.
 const FRAMES_A_CAMERA: usize = 1000;
 
 /// Arrival times of each camera's frames, kept until the tracks that follow from them come.

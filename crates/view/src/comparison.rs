@@ -16,7 +16,7 @@ use crate::{ViewError, blueprint, colour, ground};
 /// Colour of the true targets.
 const TRUTH: Color = Color(rerun_types::datatypes::Rgba32::from_rgb(240, 240, 240));
 /// Longest gap between two places that are joined by a line, s: over a longer one the track was
-/// lost.
+/// lost. With half of it instants that are half a second apart are not joined.
 const LONGEST_JOIN_S: f64 = 1.0;
 
 /// A place of a target or track at a time.

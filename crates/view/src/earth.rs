@@ -17,16 +17,17 @@ pub(crate) const MAP: &str = "map";
 /// Entity path of the picture of the ground.
 const PICTURE: &str = "world/ground/picture";
 /// Brightness to which the picture is dimmed, of 255: sight lines and trails must stand out from
-/// it.
+/// it. With half of it little is left of a dark picture; undimmed it is as bright as they are.
 const DIMMED: u8 = 130;
 /// How far the picture lies below the grid, as a share of the diagonal of the site's extent: in one
-/// plane the two would flicker.
+/// plane the two would flicker. With half of it they may still flicker from afar.
 const BELOW_GRID: f64 = 1e-3;
 
 /// Size of a point of the map at the equator, at the zoom where the whole map is 256 points wide,
 /// m.
 const WHOLE_MAP_M: f64 = 156_543.0;
-/// Length of the site's diagonal on the map, points: so it fits into the smallest view.
+/// Length of the site's diagonal on the map, points: so it fits into the smallest view. With half
+/// of it the map shows twice as far; with twice as much the site is cut off in a small view.
 const SITE_POINTS: f64 = 250.0;
 
 /// A picture of the ground from above, north up: an orthophoto, a plan, a piece of a map.

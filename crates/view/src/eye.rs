@@ -10,11 +10,14 @@ use crate::extent::Extent;
 const HALF_HEIGHT: f64 = 0.52;
 /// The same horizontally, for a view that is wider than high.
 const HALF_WIDTH: f64 = 1.5 * HALF_HEIGHT;
-/// Factor on the distance that leaves room for labels at the borders.
+/// Factor on the distance that leaves room for labels at the borders. At 1 the labels of the
+/// outermost cameras are cut off.
 const ROOM: f64 = 1.1;
-/// Number of iterations: after these the target moves by less than a pixel.
+/// Number of iterations: after these the target moves by less than a pixel. With half of it the
+/// site lies a little beside the middle.
 const CENTRINGS: u32 = 4;
-/// Least distance from which anything is looked at, m.
+/// Least distance from which anything is looked at, m. With half of it the eye would look from
+/// within a frustum, which is 12 m long.
 const CLOSEST_M: f64 = 20.0;
 
 /// An eye that has a whole box in view, from the south and above, so that north is up in the

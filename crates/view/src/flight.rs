@@ -14,7 +14,7 @@ use crate::paths::{TIMELINE, image_path};
 use crate::{ViewError, blueprint, colour, draw, ground};
 
 /// Most labels of a camera that are drawn, each at its time: so a picture of ten minutes opens at
-/// once.
+/// once. With half of it such a picture has a label every 0.4 s and not every 0.2.
 const MOST_SHOWN: usize = 3000;
 /// Colour of the target's trajectory and of what belongs to no camera.
 const WAY: Color = Color(rerun_types::datatypes::Rgba32::from_rgb(240, 240, 240));

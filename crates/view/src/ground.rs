@@ -9,7 +9,7 @@ use crate::ViewError;
 use crate::extent::Extent;
 
 /// Approximate number of grid cells along its longer side: enough to count by, few enough not to
-/// hide anything.
+/// hide anything. With half of it they are of 20 m instead of 10 in a site of 100 m.
 const CELLS: f64 = 8.0;
 
 /// The largest of 1, 2 and 5 times a power of ten that is not above a length.

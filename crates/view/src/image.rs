@@ -12,9 +12,10 @@ use crate::paths::image_path;
 use crate::{ViewError, colour};
 
 /// Smallest radius of a ring, pixels of the camera: a target of a few pixels must be visible inside
-/// it.
+/// it. With half of it a target of 12 pixels fills its ring.
 const LEAST_RING_PX: f64 = 12.0;
-/// Number of line segments of a ring.
+/// Number of line segments of a ring. With half of it a segment lies up to 3 % of the radius inside
+/// the circle and not 1 %, which is seen in large rings.
 const CORNERS: usize = 24;
 
 /// The part of a camera's image in which targets were, pixels of the camera.

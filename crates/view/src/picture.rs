@@ -20,22 +20,27 @@ use crate::paths::{TIMELINE, image_path};
 use crate::trail::Trail;
 use crate::{ViewError, ViewerWatch, blueprint, colour, draw, ground, legend};
 
-/// Most drawings per second: a camera's previews, a camera's sight lines, and a track.
+/// Most drawings per second: a camera's previews, a camera's sight lines, and a track. With half of
+/// these rates the picture jerks; with twice as much the viewer's memory lasts half as long.
 const PREVIEW_RATE_HZ: f64 = 5.0;
 const LINE_RATE_HZ: f64 = 10.0;
 const TRACK_RATE_HZ: f64 = 15.0;
-/// Most fusion centres whose problems are remembered.
+/// Most fusion centres whose problems are remembered. Those of one more are written again with each
+/// of its reports; with half of it, from the 501st on.
 const MOST_CENTRES: usize = 1000;
-/// Length of sight lines as long as no track tells how far they should reach, m.
+/// Length of sight lines as long as no track tells how far they should reach, m. With half of it
+/// the lines of cameras 200 m apart do not cross.
 const DEFAULT_REACH_M: f64 = 150.0;
-/// Height above the cameras where targets are expected, as long as no track shows them, m.
+/// Height above the cameras where targets are expected, as long as no track shows them, m. With
+/// half of it the first track may begin outside of the view, which is then laid out again.
 const AIR_M: f64 = 25.0;
 /// A track of which nothing was heard for this long is removed, s: each is sent twice a second, so
-/// its fusion centre is gone.
+/// its fusion centre is gone. With half of it tracks vanish where a link stalls for two seconds.
 const GHOST_S: f64 = 3.0;
 
 /// The picture is laid out about tracks with a smaller standard deviation than this, m: one that is
-/// far off must not make all others small.
+/// far off must not make all others small. With half of it a distant track that is known to 3 m may
+/// lie outside of the view.
 const LAID_OUT_SD_M: f64 = 5.0;
 
 /// The part of the cameras' images that is shown.

@@ -11,13 +11,16 @@ use rerun::{RecordingStream, RecordingStreamBuilder, RecordingStreamError, Spawn
 use thiserror::Error;
 
 /// Bytes that may be on their way to a viewer before drawing waits for it, as Rerun counts them
-/// (they take several times as much): some seconds of a site of three cameras.
+/// (they take several times as much): some seconds of a site of three cameras. With half of it
+/// drawing waits sooner where a network stalls; with twice as much the picture may lag twice as far
+/// behind.
 const MOST_IN_FLIGHT: u64 = 8 << 20;
 /// Memory at which a viewer started by us forgets its oldest data; the viewer takes half as much
-/// again.
+/// again. With half of it the past is gone twice as soon.
 const VIEWER_MEMORY: &str = "1GB";
 /// Memory in which that viewer keeps a second copy for other viewers that may connect to it.
-/// Rerun's default is a gigabyte.
+/// Rerun's default is a gigabyte. With half of it a viewer that connects later sees half as much of
+/// the past.
 const FOR_OTHER_VIEWERS: &str = "64MB";
 
 /// What can go wrong with drawing a picture.

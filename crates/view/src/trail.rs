@@ -9,9 +9,11 @@ use crate::limiter::Limiter;
 use crate::{ViewError, draw};
 
 /// Rate at which a trail is drawn, Hz. Each time it is drawn whole, which is most of what fills a
-/// viewer's memory; a lower rate also means fewer points per trail.
+/// viewer's memory; a lower rate also means fewer points per trail. With half of it a trail has a
+/// corner every 8 m at 30 m/s.
 const TRAIL_RATE_HZ: f64 = 7.5;
-/// Points of a trail: ten seconds at its rate.
+/// Points of a trail: ten seconds at its rate. With half of it, five; with twice as many a trail
+/// takes twice the viewer's memory.
 const TRAIL_POINTS: usize = 75;
 /// Rate at which a track's whole trail is drawn on the map, Hz; between two drawings a track moves
 /// by less than a point of the screen.

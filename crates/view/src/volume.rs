@@ -8,13 +8,16 @@ use rerun_types::components::{Color, FillMode, MediaType, Radius};
 
 use crate::{ViewError, blueprint, colour, draw};
 
-/// Side of a drawn cube as a share of the cell's side, so that one sees between the cubes.
+/// Side of a drawn cube as a share of the cell's side, so that one sees between the cubes. With
+/// half of it cubes are dots; with twice as much the nearer ones hide those behind.
 const DRAWN_SHARE: f64 = 0.3;
-/// Opacity of the cubes, of 255.
+/// Opacity of the cubes, of 255. With half of it colours mix with those behind; opaque cubes hide
+/// them.
 const OPACITY: u8 = 150;
 /// Width and height of the colour scale's picture, pixels.
 const SCALE_PX: [u32; 2] = [40, 400];
-/// Number of labelled values beside the scale.
+/// Number of labelled values beside the scale. With half of it values between them are hard to
+/// guess, as the scale is logarithmic.
 const TICKS: u32 = 6;
 
 /// A cube of air and the standard deviation that a target's position would have in it.

@@ -11,28 +11,38 @@ use crate::reference::Adaptation;
 use crate::{PixelBox, TrackerConfig};
 
 /// Widths of the low-pass filters, px; the filter in use is the one that leaves the least noise and
-/// error together.
+/// error together. With half of each the noisiest references keep noise that the widest would take
+/// away.
 const LOW_PASSES: [f32; 5] = [0.0, 0.6, 0.9, 1.2, 1.6];
-/// Share of noise in the reference's energy below which the reference is used unfiltered.
+/// Share of noise in the reference's energy below which the reference is used unfiltered. With half
+/// of it twice as many images must be averaged before the other filters are spared.
 const CLEAR_NOISE_SHARE: f32 = 0.01;
-/// Least width of the low-pass for the comparison with the anchor, px.
+/// Least width of the low-pass for the comparison with the anchor, px. With half of it the same
+/// filter is the least; with twice as much small targets lose the detail that tells the drift.
 const ANCHOR_LOW_PASS: f32 = 0.6;
 /// Share of noise in the anchor's energy above which images are still averaged into it. Below that
-/// the anchor stays as it is: with each image that is added it would drift too.
+/// the anchor stays as it is: with each image that is added it would drift too. With half of it
+/// twice as many are added, with the errors of their places.
 const ANCHOR_NOISE_SHARE: f32 = 0.02;
-/// Correlation with the anchor below which the target is taken to look different by now.
+/// Correlation with the anchor below which the target is taken to look different by now. With half
+/// of it a target that has changed is still fitted to the anchor, and its drift is chance.
 const ANCHOR_LEAST_SCORE: f32 = 0.6;
-/// Stiffness of scale and turn in the fit to the anchor.
+/// Stiffness of scale and turn in the fit to the anchor, as a share of the reference's energy: a
+/// prior that neither has changed. With half of it the turn of a round target, which noise alone
+/// tells, comes out up to twice as large.
 const ANCHOR_STIFFNESS: f64 = 0.02;
 /// Share of new images in the reference at which the working reference is computed again: a few
 /// images' worth. Reasoned: with half of it that is done, and costs, twice as often.
 const MOST_CHANGED: f32 = 0.1;
 /// Least amount by which an image adds to that share: its size and direction are new, even where
-/// nothing is learned.
+/// nothing is learned. With half of it a fixed reference takes a new size in every seventh image
+/// instead of every fourth.
 const SHAPE_SHARE: f32 = 0.03;
-/// Floor of the steepness (see [`steepness`]): a reference of noise alone tells no place.
+/// Floor of the steepness (see [`steepness`]): a reference of noise alone tells no place. With half
+/// of it its places may count for a quarter, with twice as much for four times as much.
 const LEAST_STEEPNESS: f64 = 0.15;
-/// Bounds of a target's scale, over its first size.
+/// Bounds of a target's scale, over its first size. With half of the range, from a half to twice,
+/// the reference of a target that comes to a third of its first distance stays too small.
 const SCALE_RANGE: [f64; 2] = [0.25, 4.0];
 
 /// Drift of a reference against the anchor: the displacement in its own pixels, log scale and turn.

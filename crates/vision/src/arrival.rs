@@ -16,29 +16,38 @@ use crate::scene::ScenePicture;
 /// with twice as much faint targets as scene.
 const UNCHANGED: f64 = 0.1;
 /// Standard deviation of the contrast that the scene itself has in a target's place, as a share of
-/// the target's usual contrast: often it is as much as half.
+/// the target's usual contrast: often it is as much as half. With half of it such a scene lies at
+/// two standard deviations, and a target that comes there is doubted.
 const SCENE_SHARE: f64 = 0.5;
 /// Standard deviation of the change in contrast of something on the lens, as the scene behind it
 /// changes, as a share of the target's usual contrast: two scenes, each with a quarter of it. With
 /// half of it digits before clouds count as having come, with twice as much a target that comes to
 /// where a cloud was counts as having been there before.
 const BEHIND: f64 = 0.35;
-/// Standard deviation of the registration of the pictures, px per axis.
+/// Standard deviation of the registration of the pictures, px per axis. With half of it the edges
+/// of an unchanged scene change by up to four times the expected variance, and count as having
+/// come.
 const REGISTERED_PX: f64 = 0.25;
 /// Pixels per independent sample ("look"): neighbours are blurred and compressed together, ...
 const PIXELS_A_LOOK: f64 = 4.0;
-/// ... and a target has at most this many looks, however large: its parts change together.
+/// ... and a target has at most this many looks, however large: its parts change together. With
+/// half of the first a small target's blurred noise counts twice; with half of the second a large
+/// target's pixels must change by 5.3 times the expected variance instead of 3.6 to tell `MOST`.
 const MOST_LOOKS: f64 = 12.0;
 /// Most that one picture tells, either way, as a log likelihood ratio: what the model leaves out
-/// must remain possible.
+/// must remain possible. With half of it a target held for certain is doubted in the second image
+/// instead of the first, at 30 per second.
 const MOST: f64 = 8.0;
 /// Range of the factor by which light or exposure may change the contrast of a scene. With no range
 /// at all whatever is there counts as having come with every step of the light, where there is no
 /// noise to hide the difference.
 const LIGHTER: [f64; 2] = [0.5, 2.0];
-/// Least share of the reference's energy that must lie where the target was not before.
+/// Least share of the reference's energy that must lie where the target was not before. With half
+/// of it contrasts are told by an eighth of the energy, with eight times the whole's noise
+/// variance; with twice as much a slow target's pictures tell nothing for longer.
 const LEAST_FREE: f64 = 0.25;
-/// Fewest pixels that tell anything.
+/// Fewest pixels that tell anything. With half of it the two that are left are fitted exactly by
+/// brightness and contrast, and never change.
 const LEAST_PIXELS: f64 = 4.0;
 
 /// The reference's place now, compared with that in a picture of the scene without the target.

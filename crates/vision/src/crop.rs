@@ -6,7 +6,7 @@ use std::ops::Range;
 use crossfix_correlation::Plane;
 
 /// Largest brightness of a sample: no camera is brighter, and sums of larger squares would lose the
-/// rest.
+/// rest. With half of it the same: 16 bits end at 65535.
 pub(crate) const BRIGHTEST: f32 = 1e6;
 
 /// Makes broken samples (not finite, or brighter than `BRIGHTEST`) black: one of them must not

@@ -26,10 +26,12 @@ const CANDIDATE_S: f64 = 0.5;
 /// have flown into the box by then (reasoned, not measured).
 const SHOWN_WITHIN_S: f64 = 0.5;
 /// Largest ratio of a candidate's mean side to the target's, either way: of a drone before trees
-/// only the brightest part is found.
+/// only the brightest part is found. With half of it a part of less than a quarter of its area
+/// stands in for nothing.
 const STAND_IN_SIZES: f64 = 4.0;
 /// Largest probability that is stated for a candidate being the target: nothing is known for it but
-/// that it moves, and that nothing else has been found.
+/// that it moves, and that nothing else has been found. With half of it only the number that is
+/// stated changes.
 const STAND_IN_CERTAINTY: f64 = 0.5;
 
 impl ImageTracker {

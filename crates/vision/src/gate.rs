@@ -19,7 +19,8 @@ use crate::state::TargetBelief;
 /// lost with half of it instead of 1.7, and with twice as much, a version earlier, 2.7 instead of
 /// 2.2.
 const HIDDEN_S: f64 = 0.05;
-/// Log likelihood ratio of a placement outside the image.
+/// Log likelihood ratio of a placement outside the image. With half of it the same: `e^-25` of a
+/// weight is none.
 const IMPOSSIBLE: f32 = -50.0;
 
 /// Placements of a reference about the prediction, and the part of the image that they cover.

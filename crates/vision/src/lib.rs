@@ -99,7 +99,8 @@ pub struct PixelBox {
     pub height: f64,
 }
 
-/// Largest coordinate of a place, px: no place of an image is further from its corner.
+/// Largest coordinate of a place, px: no place of an image is further from its corner. With half of
+/// it the same.
 const FARTHEST: f64 = 1e6;
 
 impl ImagePoint {

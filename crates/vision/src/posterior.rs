@@ -38,15 +38,15 @@ pub(crate) struct Posterior {
     pub(crate) elsewhere: PosteriorPart,
     pub(crate) unseen: f64,
     /// Likelihood of the image under this prior over the prior's probability that the target is
-    /// visible. Hypotheses are weighed by it, so one that was hidden gains by up to two in an image.
-    /// By the likelihood itself, with targets hidden for 0.15 s, ten seeds' sequences lose 2.5 % of
-    /// the frames in place of 1.8, and the visible clips are the same.
+    /// visible. Hypotheses are weighed by it, so one that was hidden gains by up to two in an
+    /// image. By the likelihood itself, with targets hidden for 0.15 s, ten seeds' sequences lose
+    /// 2.5 % of the frames in place of 1.8, and the visible clips are the same.
     pub(crate) evidence: f64,
 }
 
 impl Posterior {
-    /// The posterior if what is near the peak is the target with probability `probability` only; the
-    /// rest of that mass goes to `unseen`.
+    /// The posterior if what is near the peak is the target with probability `probability` only;
+    /// the rest of that mass goes to `unseen`.
     pub(crate) fn doubted(&self, probability: f64) -> Self {
         let near = PosteriorPart { mass: self.near.mass * probability, ..self.near };
         Self { near, unseen: self.unseen + self.near.mass - near.mass, ..*self }

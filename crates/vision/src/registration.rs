@@ -4,22 +4,26 @@
 use crossfix_correlation::Plane;
 
 /// Step between the pixels of the smoothed picture that are used, in rows and columns: those
-/// between tell the same.
+/// between tell the same. With half of it they cost four times as much.
 pub(crate) const STRIDE: usize = 2;
-/// Most iterations of the registration, and the length of a step that ends it, pixels.
+/// Most iterations of the registration, and the length of a step that ends it, pixels. With half of
+/// the first a shift of more than three of the longest steps is not reached, with half of the
+/// second a step more is taken.
 const STEPS: usize = 6;
 const SETTLED: f32 = 0.003;
-/// Longest step, pixels: a longer one is a mistake, and is cut to this.
+/// Longest step, pixels: a longer one is a mistake, and is cut to this. With half of it shifts of
+/// more than `STEPS` pixels are not reached.
 const LONGEST_STEP: f32 = 2.0;
 /// Difference of brightness beyond which a pixel counts for less, levels: a target that moves is no
-/// turn.
+/// turn. With half of it the edges that tell a large turn count for less, and it is not reached.
 const OUTLYING: f32 = 5.0;
 /// Least reduction of the misfit by a turn, in units of one pixel's mean misfit. Two smoothed
 /// pictures of noise alone fit better by up to 60 at some shift nearby, as only one pixel in
 /// eighteen is independent; with half of it a clear sky turns by chance, with twice as much a turn
 /// is told a frame later.
 const SIGNIFICANT: f32 = 120.0;
-/// Fewest pixels in common (sum of their weights) that tell a turn.
+/// Fewest pixels in common (sum of their weights) that tell a turn. With half of it they may all be
+/// those of one target.
 pub(crate) const LEAST_COMMON: f32 = 50.0;
 
 /// Indices of a row that, moved by `by`, are in the row together with the next index.
@@ -109,14 +113,16 @@ fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> RegistrationEquation
 }
 
 /// Columns and rows of the tiles into which a picture is divided, to tell a turn from a target that
-/// moves.
+/// moves. With half of each two targets with what is `AROUND` them cover nearly all tiles.
 const TILES: [usize; 2] = [12, 9];
 /// Reach of a target about the tile whose misfit a turn would lessen most, tiles: 50 px of a
-/// picture of 320x240, and what smoothing makes of them.
+/// picture of 320x240, and what smoothing makes of them. With half of it the far edges of such a
+/// target count as a turn.
 const AROUND: usize = 2;
 
 /// Least share of the whole gain that a turn must bring away from the tiles that gain most: the
-/// edges of a large target's smoothed picture reach a twentieth that far.
+/// edges of a large target's smoothed picture reach a twentieth that far. With half of it those
+/// alone are enough.
 const ELSEWHERE: f32 = 0.1;
 
 /// Weighted sum of the squared differences in each tile, and the sum of the weights.

@@ -18,26 +18,30 @@ use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
 const PICTURES: usize = 6;
 const SPACING_S: f64 = 0.6;
 /// Preferred age of the picture from which a change is computed, s: a target has moved by its own
-/// size by then.
+/// size by then. With half of it a target that has moved by half its size cancels by half.
 const CHANGED_S: f64 = 1.0;
 /// Side of the blocks that make one pixel of the coarse picture, px; the camera's turn is found in
 /// that. In single pixels the noise has more slope than clouds have, and no turn is noticed.
 const COARSENESS: usize = 8;
 /// How often the coarse picture is smoothed, each time with weights of a quarter, a half and a
-/// quarter for neighbours.
+/// quarter for neighbours. With half of it noise keeps more of its slope, against the scene's.
 const SMOOTHED: usize = 3;
 /// A camera stands still that has turned by less than this since it was last registered, px: twice
 /// what noise makes of it ...
 const STILL_PX: f64 = 0.1;
 /// ... and is registered again after this long, s, unless it is jerked: with half of it an image
-/// costs 10 us more, one of 640x480 30 us.
+/// costs 10 us more, one of 640x480 30 us. With half of the first noise alone has images
+/// registered.
 const STILL_S: f64 = 0.1;
 
 /// The camera is jerked if the change from one image to the next exceeds the usual one by this
 /// factor, and by this many levels, ...
 const JERK: f32 = 1.5;
 const JERK_LEVELS: f32 = 0.25;
-/// ... where the usual change is a running mean, in which the last image has this share.
+/// ... where the usual change is a running mean, in which the last image has this share. With half
+/// of `JERK` every image is a jerk whose usual change exceeds a level, with half of `JERK_LEVELS`
+/// so is a flicker of an eighth of a level; with half of this share a wind that sets in is one for
+/// twice as many images.
 const USUAL_SHARE: f32 = 0.05;
 
 /// A picture of the scene.
@@ -79,7 +83,7 @@ impl ScenePicture {
 }
 
 /// Of this many blocks along a row one is looked at: there are hundreds, and a jerk has to change
-/// half of them.
+/// half of them. With half of it the glance costs twice as much and tells the same.
 const GLANCED: usize = 4;
 
 /// One row of some blocks, by which a jerk of the camera is noticed at a tenth of the cost of a

@@ -16,7 +16,8 @@ const SIZES: f64 = 2.5;
 /// same is found; with half of it one sequence of 228, whose target no image shows at first, is
 /// lost for good.
 const LEAST_CLEAR: f32 = 0.7;
-/// How far its middle may be off, in the larger sides.
+/// How far its middle may be off, in the larger sides. With half of it a target of which the
+/// outline shows one end is not looked for at its middle.
 const OFF_SIDES: f64 = 0.5;
 
 /// A find of the detector that may be a lost target.

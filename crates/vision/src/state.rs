@@ -16,14 +16,19 @@ use crate::motion::ImageMotion;
 use crate::scratch::Scratch;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
-/// Frames without the target after which it is searched for.
+/// Frames without the target after which it is searched for. With one, each blurred image begins a
+/// search; with six a lost target runs on with its prediction for 0.1 s longer, at 30 images per
+/// second.
 const SEARCH_AFTER_FRAMES: u32 = 3;
-/// Weight of a frame's noise in the running estimate.
+/// Weight of a frame's noise in the running estimate. With half of it the noise in front of another
+/// background is known after six images instead of three.
 const NOISE_SHARE: f32 = 0.3;
-/// Certainty above which a target counts as seen.
+/// Certainty above which a target counts as seen. With half of it a target is measured where it is
+/// likelier not to be.
 pub(crate) const SEEN: f64 = 0.5;
 /// Random walk of the log scale and of the turn, standard deviations per frame of a thirtieth of a
-/// second, and their largest variances.
+/// second, and their largest variances. With half of the first a size is followed within 17 images
+/// instead of 9; with half of the second the gain after a long loss is 0.95 instead of 0.97.
 const SHAPE_WALK: [f64; 2] = [0.006, 0.02];
 const MOST_SHAPE_VARIANCE: [f64; 2] = [0.09, 0.25];
 /// Variances of both of a reference that has just been cut out: it has the target's size and

@@ -11,7 +11,8 @@ use crate::scratch::Scratch;
 use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
 /// Bounds of the time between images, s; other intervals are clamped to them: after a longer pause
-/// nothing is known of a target anyway, and no camera is faster.
+/// nothing is known of a target anyway, and no camera is faster. With half of the first a camera of
+/// less than two images per second forgets its scene with each; with half of the second the same.
 const LONGEST_INTERVAL: f64 = 1.0;
 const SHORTEST_INTERVAL: f64 = 1e-4;
 
@@ -72,11 +73,13 @@ struct BackgroundSnapshot {
     taken: Timestamp,
 }
 
-/// Age at which a snapshot is replaced, s.
+/// Age at which a snapshot is replaced, s. With half of it a picture is copied twice as often; with
+/// twice as much it shows clouds as they were up to a second ago.
 const SNAPSHOT_AGE_S: f64 = 0.5;
 
 /// Refused images in a row that must agree with each other before the tracker believes them and not
-/// the last accepted one.
+/// the last accepted one. With one, two late images in a row take the time back and forget the
+/// scene.
 const RESYNCHRONISE_AFTER: u32 = 3;
 
 /// When an image was taken, and its sides.

@@ -10,7 +10,7 @@ use super::state::{CameraPriors, Flight, FlightState, Priors};
 use crate::lens;
 
 /// Standard deviations of unknowns of which nothing is known beforehand: wide against anything that
-/// a site has.
+/// a site has. With half of them the same.
 const WIDE_ROTATION_RAD: f64 = 10.0;
 const WIDE_M: f64 = 1e4;
 const WIDE_S: f64 = 1e4;
@@ -19,7 +19,8 @@ const WIDE_S: f64 = 1e4;
 /// phone's clock is 80 ms off after a minute and a half, where 9 ms are stated.
 const RATE_KNOWN_BY: f64 = 1e-3;
 /// A sensor is read out within nothing to a whole frame's time: prior mean and standard deviation
-/// of the read-out, as a share of that time.
+/// of the read-out, as a share of that time. With half of it a whole frame's time would lie three
+/// deviations off.
 const READOUT_SHARE: f64 = 0.5;
 
 struct Linear(NormalEquations);
@@ -119,11 +120,13 @@ impl FlightState {
 }
 
 /// Steps at most; from a start within a metre and a tenth of a second, five to eight are enough.
+/// With half of it a rough start may end before it has settled, and is used as it is then.
 const MOST_STEPS: usize = 30;
-/// A step that changes the cost (see [`Cost`]) by less than this is the last; ...
+/// A step that changes the cost (see [`Cost`]) by less than this is the last (all unknowns together
+/// move by a tenth of a deviation then; with half of it the same); ...
 pub(super) const SETTLED: f64 = 0.01;
 /// ... and by this while the noise is still being found: with a hundred unknowns, a tenth of a
-/// deviation each.
+/// deviation each. With half of it rounds take more steps to find the same noise.
 pub(super) const NEARLY_SETTLED: f64 = 1.0;
 
 /// The state of least cost, and its covariance.
@@ -184,12 +187,14 @@ pub(super) fn adjust(
     Some(AdjustedFlight { state, covariance: solution.covariance()?, cost })
 }
 
-/// Share of each diagonal element that it is enlarged by at first, ...
+/// Share of each diagonal element that it is enlarged by at first (with half of it the same), ...
 const FIRST_DAMPING: f64 = 1e-6;
 /// ... the factor by which that share grows where a step makes the fit worse, and shrinks where
-/// better, ...
+/// better (with half of it 13 tries lead from the first value to the last, in the place of nine),
+/// ...
 const DAMPING_STEP: f64 = 10.0;
-/// ... and its largest value.
+/// ... and its largest value. With half of it the same: steps are hundreds of times shorter than
+/// the plain ones by then.
 const MOST_DAMPING: f64 = 1e3;
 
 fn linearised(model: &AdjustmentModel<'_>, state: &FlightState) -> NormalEquations {

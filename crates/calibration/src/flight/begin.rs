@@ -18,28 +18,39 @@ use nalgebra::{Point3, Rotation3};
 /// Labels whose median misfit to the log is above this are not of its target, rad: lens files and
 /// clocks that are not known yet leave up to 4 mrad. With half of it phones are refused.
 const MOST_MISFIT_RAD: f64 = 8e-3;
-/// ... plus this many deviations of the log's own errors, as they are seen from the camera.
+/// ... plus this many deviations of the log's own errors, as they are seen from the camera. With
+/// half of it a camera near the target is refused for the errors of a log good to metres.
 const LOG_DEVIATIONS: f64 = 3.0;
-/// A start whose median misfit to the log is above this is compared with the mirror image, rad, ...
+/// A start whose median misfit to the log is above this is compared with the mirror image, rad
+/// (with half of it the same, as a second search for more cameras; with twice as much the mirror
+/// image of a short flight may pass), ...
 const DOUBTED_RAD: f64 = 2e-3;
-/// ... which is taken to be what was flown if it fits this many times better.
+/// ... which is taken to be what was flown if it fits this many times better. With half of it
+/// chance decides for a level flight, which both fit.
 const CLEARLY_BETTER: f64 = 3.0;
-/// The trajectory extends beyond the labels by this, s: their times may still move.
+/// The trajectory extends beyond the labels by this, s: their times may still move. With half of it
+/// labels of a clock that moves by more than a second end beside the trajectory and count as
+/// unseen.
 const MARGIN_S: f64 = 2.0;
 /// Two cameras see the target together if they do so within this time, s: that of a knot of the
-/// trajectory.
+/// trajectory. With half of it labels are lost where the other cameras have fewer than five a
+/// second.
 const TOGETHER_S: f64 = 0.2;
 /// Without a log, this many pairs of cameras are tried as a start, those of least doubt: one that
-/// saw a short or a flat piece of the trajectory leads astray.
+/// saw a short or a flat piece of the trajectory leads astray. With half of it such a pair may be
+/// the only one.
 const PAIRS_TRIED: usize = 3;
 /// Two relative poses fit alike if the misfit of one is at most this many times the other's: the
-/// two of a flight in a plane fit to within their noise, ...
+/// two of a flight in a plane fit to within their noise (with half of it only the better one
+/// counts, which may be the wrong one), ...
 const ALIKE_TIMES: f64 = 2.0;
 /// ... and are different if cameras are turned differently by more than this, rad: starts from two
-/// pairs of cameras that lead to one solution differ by less.
+/// pairs of cameras that lead to one solution differ by less. With half of it starts of one
+/// solution may count as two, and the flight is refused.
 const OTHERWISE_RAD: f64 = 0.1;
 /// Label errors that are assumed before anything is known, pixels: a hand's or a tracker's, and
-/// what a lens file leaves.
+/// what a lens file leaves. With half of it the first round gives labels that a rough start misses
+/// less weight; later rounds find the noise.
 const FIRST_NOISE: LabelNoise = LabelNoise { white_px: 0.5, lasting_px: 1.4, lasting_s: 0.5 };
 /// Power of a clock's wander in the first round, s^2/s: a phone's, which is large. Begun with too
 /// small a value it would not be found.

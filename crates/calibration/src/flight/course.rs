@@ -10,7 +10,8 @@ use super::state::{Flight, FlightState, Priors, RATE_SD};
 use crate::survey::Survey;
 
 /// Between samples farther apart than this the target's place counts as unknown, s: or than this
-/// many times the median interval.
+/// many times the median interval. With half of them one lost sample is a gap in a log of one a
+/// second.
 const GAP_S: f64 = 1.0;
 const GAP_STEPS: f64 = 2.5;
 
@@ -28,7 +29,11 @@ pub(super) struct Course {
 impl Course {
     /// From a log alone. `None`: the adjustment has no solution.
     pub(super) fn of(log: &FlightLog) -> Option<Self> {
+        /// Rounds of trajectory and jerk by turns. With half of them a first value that is far off
+        /// may still show.
         const ROUNDS: usize = 12;
+        /// Power of the jerk that is begun with, m^2/s^5: with half of it the same, as rounds find
+        /// it.
         const FIRST_JERK: f64 = 10.0;
         let (from, to) = (log.samples.first()?.time_s, log.samples.last()?.time_s);
         let flight = Flight { cameras: &[], log: Some(log), survey: &Survey::default() };

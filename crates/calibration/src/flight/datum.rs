@@ -11,6 +11,7 @@ use super::model::{CLOCK, CameraUnknowns};
 use super::state::FlightState;
 
 /// Without a log the common time is one camera's, whose clock may show anything: its deviation, s.
+/// With half of it the same.
 const UNKNOWN_S: f64 = 1e3;
 
 /// How the unknowns of a site's cameras follow its datum.
@@ -92,7 +93,8 @@ impl Followers {
         differences - &self.by_datum * (&shown.gain * differences)
     }
 
-    /// The site's datum, where `prior_information` of the information on it comes from no measurement.
+    /// The site's datum, where `prior_information` of the information on it comes from no
+    /// measurement.
     pub(super) fn datum(
         &self,
         shown: &DatumEstimator,
@@ -131,7 +133,8 @@ impl DatumEstimator {
 }
 
 /// Deviations of components that nothing determines, in the place of infinite ones: shift (m), turn
-/// (rad), growth, lateness (s), slowness.
+/// (rad), growth, lateness (s), slowness. With half of them a site whose place nobody has surveyed
+/// is stated to be known to 150 m, and counts for more than it should beside sites that are known.
 const UNKNOWN: [f64; Datum::WAYS] = [300.0, 300.0, 300.0, 3.0, 3.0, 3.0, 3.0, 30.0, 0.1];
 
 /// Inverse of the information on a datum, with no deviation larger than [`UNKNOWN`].

@@ -96,13 +96,16 @@ pub enum Refusal {
 }
 
 /// Longest flight, h. The equations take memory in proportion to its time: an hour of six cameras
-/// takes 0.2 GB, and minutes.
+/// takes 0.2 GB, and minutes. With half of it a flight of more than half an hour has to be cut by
+/// hand.
 pub(super) const LONGEST_FLIGHT_H: f64 = 1.0;
 /// Longest log, h. All of its times are tried for each camera's clock: six hours take seconds per
 /// camera, and minutes for one that does not fit, as a correction that would make it fit is
-/// searched.
+/// searched. With half of it the log of a morning of flights has to be cut by hand first.
 pub(super) const LONGEST_LOG_H: f64 = 6.0;
-/// Least number of samples of a log.
+/// Least number of samples of a log. With half of it ten seconds of a receiver of one sample a
+/// second, hardly a turn, may be fitted by wrong poses and clocks as well.
 pub(super) const LEAST_SAMPLES: usize = 20;
-/// Least number of labels of a camera.
+/// Least number of labels of a camera. With half of it half a second of a video, nearly a straight
+/// line in the image, would count as a flight.
 pub(super) const LEAST_LABELS: usize = 30;

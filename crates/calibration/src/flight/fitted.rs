@@ -75,6 +75,7 @@ fn fitted_label(state: &FlightState, index: usize, label: &Label) -> Option<Fitt
         own_time_s: label.time_s,
         time_s,
         pixel: label.pixel,
+        // A residual is the prediction less the label.
         beside_px: -seen.residual,
         motion_px_per_s: seen.by_time,
         place: state.way.place(&weights),

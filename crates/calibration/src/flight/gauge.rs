@@ -16,7 +16,8 @@ use super::state::FlightState;
 
 /// Deviations of the constraint on the site as a whole: shift (m), turn (rad), growth, lateness
 /// (s). Rounding errors are ten digits below them, far under the accuracy of the cameras beside the
-/// datum. The clocks' common rate has a prior of its own.
+/// datum. The clocks' common rate has a prior of its own. With half of them the rough start pulls
+/// four times as hard against what a survey says.
 const HELD: [f64; Datum::WAYS - 1] = [10.0, 10.0, 10.0, 0.1, 0.1, 0.1, 0.1, 1.0];
 
 /// The constraint.
@@ -30,7 +31,8 @@ pub(super) struct Gauge {
 impl Gauge {
     /// Constraint to a state.
     pub(super) fn of(from: &FlightState) -> Option<Self> {
-        // A turn is weighted by how far it moves a point at this range.
+        // A turn is weighted by how far it moves a point at this range, m. With half of it the
+        // same: it only decides how much of a difference counts as a turn.
         const RANGE_M: f64 = 30.0;
         let followers = Followers::of(from);
         let starts = from.starts();
@@ -49,6 +51,7 @@ impl Gauge {
         let first = state.order().chain();
         let pairs = self.from.cameras.iter().zip(&state.cameras);
         let moved = DVector::from_vec(pairs.flat_map(|(a, b)| step_between(a, b)).collect());
+        // The site's part of the cameras' movements, which alone is constrained.
         let as_a_whole = &self.gain * moved;
         for (way, sd) in HELD.iter().enumerate() {
             let gain = self.gain.row(way);

@@ -14,10 +14,11 @@ use super::state::{Flight, FlightState, Priors};
 use crate::label_noise::LabelNoise;
 
 /// Of a camera's labels one in this many is compared: they are many, and neighbours tell the same.
+/// With half of it the same, in twice the time.
 const STRIDE: usize = 20;
 /// A half whose own stated deviation in the image is more than this many times the deviation of its
 /// labels has seen too little to be compared: from a drone that stands on the ground anything may
-/// come out.
+/// come out. With half of it more cameras get the others' mean ratio in the place of their own.
 const MOST_STATED: f64 = 10.0;
 
 /// For each camera the distance between its two halves' results in the image, divided by the

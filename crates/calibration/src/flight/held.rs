@@ -4,7 +4,8 @@ use super::results::{CameraResult, FlightResult};
 use crate::survey::Survey;
 
 /// No clock is taken to be known better than this at another time than that of its calibration, s:
-/// a weighted mean of zero deviations does not exist.
+/// a weighted mean of zero deviations does not exist. With half of it a clock that is stated better
+/// counts four times as much, and may decide alone.
 const LEAST_CLOCK_SD_S: f64 = 1e-3;
 /// Index of the lateness among the datum's components.
 const LATE: usize = 7;

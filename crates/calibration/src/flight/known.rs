@@ -11,7 +11,7 @@ use crate::calibrated_camera::CalibratedCamera;
 use crate::lens;
 
 /// Least standard deviation of a known pose or lens: a covariance of zeros has no Cholesky factor.
-/// In the unknowns' units (rad and m of a pose).
+/// In the unknowns' units (rad and m of a pose). With half of it the same.
 const LEAST_SD: f64 = 1e-6;
 
 impl Flight<'_> {

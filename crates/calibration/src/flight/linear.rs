@@ -98,7 +98,8 @@ pub(super) fn robust(pairs: &[DirectionToPlace]) -> Option<AffineMap> {
     best.map(|(_, linear)| linear)
 }
 
-/// Misfit below which outliers need no smaller weights, rad.
+/// Misfit below which outliers need no smaller weights, rad. With half of it the same: only labels
+/// without errors fit as well.
 const LEAST_RAD: f64 = 1e-5;
 
 /// The direct linear transformation: `d x (M X + m) = 0` for every direction d and place X.
@@ -229,5 +230,5 @@ fn squares<'a, const H: usize, const N: usize>(
 }
 
 /// Iterations at most: a symmetric matrix of a dozen rows takes about ten; one with values that are
-/// not numbers would never end.
+/// not numbers would never end. With half of it the same.
 const MOST_ITERATIONS: usize = 200;

@@ -5,9 +5,12 @@ use nalgebra::Vector2;
 use super::fitted::FittedLabel;
 use super::linear::median;
 
-/// Block over which residuals are averaged, s: labels err alike for as long.
+/// Block over which residuals are averaged, s: labels err alike for as long. With half of it
+/// neighbouring blocks share their errors, and chance looks like a knock.
 const BLOCK_S: f64 = 1.0;
-/// Least number of blocks in each part.
+/// Least number of blocks in each part. With half of it a bird of three seconds at an end outvotes
+/// the median of a part; with twice as much a knock in the first or last quarter of a minute is put
+/// later or earlier.
 const LEAST_BLOCKS: usize = 8;
 
 /// A moment at which a camera's mean residual changes.

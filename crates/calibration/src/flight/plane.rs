@@ -3,7 +3,8 @@
 
 use nalgebra::{Matrix3, SMatrix, Vector3};
 
-/// Eigenvalues nearer together than this are equal: the cameras stand in one place.
+/// Eigenvalues nearer together than this are equal: the cameras stand in one place. With half of it
+/// the same.
 const ALIKE: f64 = 1e-6;
 
 /// The homography `b ~ H a` from the first camera's directions to the second's, for places in a

@@ -9,7 +9,8 @@ use super::rows::Cost;
 use super::spline::{KNOT_S, SPAN};
 use super::state::{Flight, FlightState, Priors};
 
-/// Least size: a trajectory that hovers in a point has no size to be pulled on, m^2.
+/// Least size: a trajectory that hovers in a point has no size to be pulled on, m^2. With half of
+/// it the same: a size is a sum over all coefficients, five a second, and any flight has far more.
 const LEAST_SIZE2: f64 = 1.0;
 
 impl FlightState {

@@ -5,7 +5,8 @@ use super::noise::Tails;
 pub(super) use super::normal::ResidualRow;
 
 /// Residual, in standard deviations, of a label that the trajectory does not reach or whose target
-/// lies behind the camera.
+/// lies behind the camera. With half of it the same: by heavy tails its two rows cost 70 in the
+/// place of 79.
 pub(super) const UNSEEN: f64 = 1e3;
 
 /// Collects rows that share one kind of tails.

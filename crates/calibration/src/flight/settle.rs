@@ -9,15 +9,18 @@ use super::spline::{KNOT_S, THIRD_DIFFERENCE};
 use super::state::{CameraPriors, Flight, FlightState, Priors};
 use crate::label_noise::LabelNoise;
 
-/// Rounds in which deviations and powers are estimated beside the unknowns.
+/// Rounds in which deviations and powers are estimated beside the unknowns. With half of it a
+/// steady clock's wander may not have come down from the large value that it begins with.
 const ROUNDS: usize = 6;
 /// Prior of a clock's wander, s^2/s: the usual value, 0.03 ms after a second, counts as two steps
-/// that were observed; the least is a crystal's.
+/// that were observed; the least is a crystal's. With half as many steps chance decides where
+/// labels tell of few; with half of the least the same.
 const USUAL_WANDER: f64 = 1e-9;
 const USUAL_STEPS: f64 = 2.0;
 const LEAST_WANDER: f64 = 1e-12;
 /// Extrapolation of the wander from round to round: the value found is multiplied again by the
-/// factor by which it changed, but by this at most.
+/// factor by which it changed, but by this at most. With half of it the rounds end before a value
+/// that is far off is reached; with twice as much they may overshoot.
 const MOST_AHEAD: f64 = 3.0;
 
 /// Adjusts, finds the noise in what is left, and adjusts again.
@@ -95,6 +98,8 @@ pub(super) fn residuals(
 /// had been enlarged ([`LabelNoise::caution`]), so it is less by that factor. What the cameras
 /// absorbed comes from the mean of many labels, which is as well known as stated.
 fn explained(flight: &Flight<'_>, adjusted: &AdjustedFlight, index: usize, caution: f64) -> f64 {
+    /// One label in this many is looked at: neighbours tell the same. With half of it the same, in
+    /// twice the time.
     const STRIDE: usize = 20;
     let (mut sum, mut count) = (0.0, 0);
     for label in flight.cameras[index].labels.iter().step_by(STRIDE) {

@@ -10,21 +10,25 @@ use super::pieces;
 use crate::lens;
 
 /// Step in which the clock's offset is tried, s: at 10 m/s and 40 m the target is then 0.03 rad off
-/// at most, which a linear solution tolerates.
+/// at most, which a linear solution tolerates. With half of it the same, in twice the time.
 const STEP_S: f64 = 0.25;
-/// Labels used in one try.
+/// Labels used in one try. With half of it a wrong offset is likelier to fit by chance.
 const TRIED: usize = 120;
-/// At least this many of them must be within the log, ...
+/// At least this many of them must be within the log (with half of it there are twelve equations
+/// for the eleven unknowns of a linear solution, which then fits any offset), ...
 const LEAST_TRIED: usize = 12;
-/// ... and this share of them.
+/// ... and this share of them. With half of it an offset at which a fifth of the labels lies along
+/// a straight piece of the log may fit best.
 const LEAST_SHARE: f64 = 0.4;
 /// A start with a smaller misfit than this is not searched again without birds, rad: lens files
-/// leave up to 4 mrad, and what birds have bent misses by tens of mrad.
+/// leave up to 4 mrad, and what birds have bent misses by tens of mrad. With half of it most
+/// cameras are searched twice, for the same start.
 const CLEAR_RAD: f64 = 4e-3;
-/// Of all offsets, this many linear solutions are computed again without the labels that do not
-/// fit, ...
+/// Of all offsets, this many linear solutions are computed again without the labels that do not fit
+/// (with half of it the right one may not be among them, where birds have bent it), ...
 const CLEANED: usize = 60;
-/// ... and this many are refined.
+/// ... and this many are refined. With half of it the right one may be left out where wrong ones
+/// fit the linear solution as well.
 const FOLLOWED: usize = 12;
 
 /// A possible pose, and how much the camera's clock is behind the common time.
@@ -70,17 +74,21 @@ pub(super) fn find(
 }
 
 /// Of several things that a camera has followed, this many are tried as the target, those that it
-/// followed longest.
+/// followed longest. With half of it a target is missed that was followed for less time than three
+/// others.
 const THINGS: usize = 6;
 /// A piece whose median misfit to the course is below this is of the target, rad: first with a
-/// start from a piece of a few seconds, where a lens file may be 50 pixels off in a corner, ...
+/// start from a piece of a few seconds, where a lens file may be 50 pixels off in a corner (with
+/// half of it pieces there are left out), ...
 const NEAR_RAD: f64 = 0.1;
-/// ... then with a start from all pieces that are near already.
+/// ... then with a start from all pieces that are near already. With half of it a lens file that is
+/// 10 mrad off in a corner has pieces left out.
 const NEARER_RAD: f64 = 0.02;
 
 /// What is left out is taken to be of another thing if the target was seen in the same frame for
 /// this share of it: with a wrong lens only parts of a flight fit, but these are not simultaneous
-/// with the rest.
+/// with the rest. With half of it a wrong lens and a few birds suffice, and the camera is
+/// calibrated by the parts that happen to fit.
 const AT_ONCE: f64 = 0.5;
 
 /// A camera's labels of the target, where most are of something else: begun with one piece, joined
@@ -288,6 +296,7 @@ fn refined(
     course: &Course,
     frame_s: f64,
 ) -> Option<CandidateStart> {
+    /// Number of steps. With half of it outliers still pull at what is returned.
     const STEPS: usize = 25;
     let mut best: Option<CandidateStart> = None;
     let mut now = start;

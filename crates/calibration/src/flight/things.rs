@@ -16,21 +16,26 @@ use super::{pieces, start, triangulation};
 use crate::survey::Survey;
 
 /// Where fewer labels than this share are simultaneous with others, those are of birds, which the
-/// fits tolerate; a target that is followed twice is none of it.
+/// fits tolerate; a target that is followed twice is none of it. With half of it a few birds cause
+/// the search, for the same labels.
 const LEAST_AT_ONCE: f64 = 0.02;
-/// This many things are tried per camera, those that it followed longest, ...
+/// This many things are tried per camera, those that it followed longest (with half of it a target
+/// is missed that was followed for less time than two others), ...
 const THINGS: usize = 4;
-/// ... of this many pairs of cameras, those of which both followed something longest: each takes
-/// seconds for a long flight, ...
+/// ... of this many pairs of cameras, those of which both followed something longest (with half of
+/// it all pairs of four cameras): each takes seconds for a long flight, ...
 const PAIRS: usize = 12;
-/// ... and this many pairs of things are extended by other pieces.
+/// ... and this many pairs of things are extended by other pieces. With half of it the right pair
+/// may be left out where two cameras saw little of the target together.
 const SEEDS: usize = 12;
 /// Sight lines of one thing miss each other by less than this in the median, rad: lens files leave
-/// up to 4 mrad.
+/// up to 4 mrad. With half of it such cameras find no thing in common.
 const MOST_ASIDE_RAD: f64 = 6e-3;
 /// A piece with more than this share of labels simultaneous with the target's is of another thing.
+/// With half of it a piece is lost where the target was labelled twice in one frame of twenty.
 const MOST_AT_ONCE: f64 = 0.1;
-/// How often two cameras' relative pose is computed again from all joined pieces.
+/// How often two cameras' relative pose is computed again from all joined pieces. With half of it
+/// pieces that only the better pose fits are not joined.
 const ROUNDS: usize = 3;
 
 /// A camera's labels in pieces.
@@ -206,6 +211,7 @@ impl Joined {
             for (place, piece) in self.pieces[side].iter().enumerate() {
                 let seen = &things[self.cameras[side]].sights[*piece];
                 let both = if side == 0 { [seen, &sights[1]] } else { [&sights[0], seen] };
+                // Where too few sight lines are simultaneous, nothing speaks against a piece.
                 let aside = self.pair.aside(both[0], both[1]).unwrap_or(0.0);
                 if aside > worst.0 {
                     worst = (aside, Some((side, place)));

@@ -12,17 +12,21 @@ use super::model::CameraLabels;
 use super::model::frame_time;
 use super::start;
 
-/// A correction must fit this many times better than what was given.
+/// A correction must fit this many times better than what was given. With half of it one may be
+/// named only because its greater freedom fits the noise.
 const CLEARLY_BETTER: f64 = 3.0;
-/// Largest median misfit of a correction, rad: lens files leave up to 4 mrad.
+/// Largest median misfit of a correction, rad: lens files leave up to 4 mrad. With half of it none
+/// is named for such cameras.
 const FITS_RAD: f64 = 8e-3;
 /// Another camera's lens fits about as well as any focal length if its misfit is at most this many
-/// times as large.
+/// times as large. With half of it exchanged lenses of one kind are reported as a wrong focal
+/// length.
 const LITTLE_WORSE: f64 = 1.5;
 /// A stretch by less than this share is not reported: lenses change by 2 %, and short flights tell
-/// no better.
+/// no better. With half of it chance would be named as the cause.
 const LEAST_STRETCH: f64 = 0.05;
-/// Tolerance of two axes' equality, and of right angles, as a share.
+/// Tolerance of two axes' equality, and of right angles, as a share. With half of it noise hides
+/// what is stretched, and nothing is named.
 const ALIKE: f64 = 0.05;
 
 /// A correction that would make a camera fit.

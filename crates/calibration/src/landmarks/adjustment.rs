@@ -7,14 +7,17 @@ use super::LandmarkPicture;
 use super::seen::{self, ClickResidual, POSE, PoseAndLens};
 use crate::lens::{self, LensUncertainty};
 
-/// Steps at most: from a place that is wrong by half of the landmarks' range it takes fifteen.
+/// Steps at most: from a place that is wrong by half of the landmarks' range it takes fifteen. With
+/// half of it a poor start may end before it has settled.
 const STEPS: usize = 40;
-/// Relative decrease of the cost below which nothing changes any more.
+/// Relative decrease of the cost below which nothing changes any more. With half of it the same.
 const SETTLED: f64 = 1e-9;
 /// Two poses fit alike if the clicks tell them apart by less than this difference of squares: three
-/// deviations.
+/// deviations. With half of it a wrong pose is returned without a word where clicks err by 2.1
+/// deviations, as in one picture of thirty.
 const ALIKE: f64 = 9.0;
-/// Poses are the same if they are within this many deviations, squared.
+/// Poses are the same if they are within this many deviations, squared. With half of it two starts
+/// that stop a little short of one pose may count as two, and the picture is refused.
 const SAME: f64 = 25.0;
 
 /// State of least cost near a start.
@@ -153,6 +156,7 @@ impl Scaled {
 pub(super) fn adjust(picture: &LandmarkPicture, start: PoseAndLens) -> Option<AdjustedCamera> {
     let mut state = start;
     let mut equations = Equations::at(picture, &state)?;
+    // Levenberg-Marquardt: a step that raises the cost is tried again, ten times more damped.
     let mut damping = 1e-3;
     for _ in 0..STEPS {
         let Some(step) = equations.step(damping) else {

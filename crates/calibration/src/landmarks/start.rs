@@ -7,12 +7,14 @@ use super::{LandmarkError, LandmarkPicture};
 use crate::lens;
 use crate::survey::LandmarkPlace;
 
-/// Places are tried in this many directions from the landmarks' mean, evenly spread ...
+/// Places are tried in this many directions from the landmarks' mean, evenly spread (26 degrees
+/// apart; with half of it 37, and the true pose may not be reached from any of them) ...
 const DIRECTIONS: usize = 60;
 /// ... and at these multiples of the distance from which things of the landmarks' spread are seen
 /// under the clicks' angles: nearer and farther, as not all landmarks are seen from the front.
 const DISTANCES: [f64; 5] = [0.4, 0.7, 1.0, 1.4, 2.0];
-/// Number of these that are adjusted, those with the least misfit.
+/// Number of these that are adjusted, those with the least misfit. With half of it a second pose
+/// that fits alike may go unnoticed.
 const ADJUSTED: usize = 40;
 
 /// Poses to adjust from. For each place the rotation that fits best is known in closed form.
@@ -32,6 +34,7 @@ pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<PoseAndLens>, Land
         centre,
         intrinsics: picture.intrinsics,
     };
+    // With a known place only the rotation is open, which has one best value.
     if let Some(place) = &picture.place {
         let turned = turned(&clicked, place.position);
         return Ok(turned
@@ -69,6 +72,7 @@ fn places(picture: &LandmarkPicture, angle: f64) -> Vec<Point3<f64>> {
     let middle = Point3::from(known.iter().map(|place| place.coords).sum::<Vector3<f64>>() / count);
     let squares: f64 = known.iter().map(|place| (place - middle).norm_squared()).sum();
     let spread = (squares / count).sqrt();
+    // Range = spread / angle: from there a thing of this spread is seen under this angle.
     let place = |distance: f64| {
         (0..DIRECTIONS).map(move |k| middle + spiral(k).into_inner() * (distance * spread / angle))
     };

@@ -30,11 +30,14 @@ const NARROW: &str = include_str!("../../../../configs/demo/narrow.toml");
 /// ten minutes. With the accuracy of a careful survey alone it would be no better than the wide
 /// cameras.
 const MOUNTED_POSE_SD: (f64, f64) = (0.1, 0.02);
-/// How long child processes may take to start, and to stop.
+/// How long child processes may take to start, and to stop. With half of it the demo may fail on a
+/// slow host.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Time from the start of the last component to the first frame, s.
+/// Time from the start of the last component to the first frame, s. With half of it the agents of a
+/// slow host would begin behind their scene.
 const RUN_UP_S: f64 = 1.0;
-/// Time granted for finding the tracks, not counted against them, s after the targets appear.
+/// Time granted for finding the tracks, not counted against them, s after the targets appear. With
+/// half of it targets whose tracks are being found would count as missed.
 const SETTLING_S: f64 = 1.5;
 
 /// See it work: a simulated site, real processes, Zenoh, fusion, a recording, and the error.

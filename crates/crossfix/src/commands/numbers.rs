@@ -1,9 +1,10 @@
 //! Numbers on the command line: parsed, or refused with the permitted range.
 
 /// Latest time accepted, seconds since the Unix epoch: the end of this century. The earliest is 0,
-/// at which simulations begin.
+/// at which simulations begin. With half of it times after 2034 would be refused.
 const LAST_WALL_TIME: f64 = 4_102_444_800.0;
-/// Highest playing speed: a day takes a minute and a half.
+/// Highest playing speed: a day takes a minute and a half. With half of it one of three minutes
+/// would be the shortest.
 const MOST_SPEED: f64 = 1000.0;
 
 pub fn number(text: &str) -> Result<f64, String> {

@@ -19,11 +19,14 @@ use crate::pace::wall_seconds;
 use crate::parts;
 use crate::shutdown::Shutdown;
 
-/// How often it is checked whether to stop.
+/// How often it is checked whether to stop. With twice as much a watch may last 0.2 s longer than
+/// asked.
 const POLL: Duration = Duration::from_millis(100);
-/// How long cameras on the network may take to answer a broadcast.
+/// How long cameras on the network may take to answer a broadcast. With half of it cameras would be
+/// missed that wait for up to half a second before they answer, as ONVIF's discovery allows.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
-/// Most different errors that are listed: a camera that fails in more ways is useless anyway.
+/// Most different errors that are listed: a camera that fails in more ways is useless anyway. With
+/// half as many the same.
 const MOST_TROUBLES: usize = 10;
 
 /// Try a camera: what it sends, how often, and what its clock is worth.
@@ -300,6 +303,7 @@ pub fn try_out(camera: LiveCamera, seconds: f64) -> (Tried, Option<Frame>) {
         }
     }
     tried.left_out = live.counts().left_out;
+    // The first image begins the time, and is itself not counted.
     let span_s = begun.elapsed().as_secs_f64() - tried.first_image_s;
     tried.rate_hz = (tried.frames.saturating_sub(1) + tried.left_out) as f64 / span_s;
     delays_s.sort_unstable_by(f64::total_cmp);

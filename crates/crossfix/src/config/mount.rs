@@ -17,7 +17,7 @@ use super::CameraFile;
 use super::stream::login;
 
 /// Least SD of a mount's angles that is accepted, mrad: a fifth of an arc second; no mount knows
-/// its angles better.
+/// its angles better. With half of it the same.
 const LEAST_SD_MRAD: f64 = 0.001;
 
 /// A mount that turns a camera about its own centre. The camera's pose is that with both angles at

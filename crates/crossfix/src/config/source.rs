@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{GstreamerConfig, StreamConfig};
 
-/// The last second of this century: a later start is taken for an error.
+/// The last second of this century: a later start is taken for an error. With half of it starts
+/// after 2034 would be refused.
 const LAST_START_S: f64 = 4_102_444_800.0;
 
 /// Where pictures, or bearings made elsewhere, come from.

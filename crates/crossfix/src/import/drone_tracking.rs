@@ -26,7 +26,7 @@ const RTK_RATE: f64 = 5.0;
 
 /// Standard deviation of the fitted camera positions, m per axis: the poses' residual is declared
 /// as their rotation's, and refitted centres of the same cameras agree to 3 to 7 cm (the data's
-/// README).
+/// README). With half of it those would be up to three SDs apart.
 const FITTED_POSITION_SD_M: f64 = 0.05;
 
 /// What to read.
@@ -59,17 +59,18 @@ pub struct ImportedFlight {
 }
 
 /// Standard deviation of a raw label, pixels, as found for these cameras. It is only stated where
-/// the cameras have not been calibrated.
+/// the cameras have not been calibrated. With half of it labels claim half of their error.
 const RAW_LABEL_SD_PX: f64 = 1.0;
 
 /// Time over which the drone's angular rate is taken, s: with a frame's it would be the labels'
 /// noise, with a second's the drone's turns would be lost.
 const RATE_OVER_S: f64 = 0.2;
 /// Frame rates that a camera may have, frames per second, and the largest rate of its clock against
-/// true time, s/s: beyond these a file is broken.
+/// true time, s/s: beyond these a file is broken. With half of either the same.
 const FRAME_RATES: std::ops::RangeInclusive<f64> = 1.0..=1000.0;
 const MOST_CLOCK_RATE: f64 = 0.1;
-/// Largest standard deviation of a clock, s: one of which nothing is known.
+/// Largest standard deviation of a clock, s: one of which nothing is known. With half of it such a
+/// clock would claim to be known to half a second.
 const MOST_CLOCK_SD_S: f64 = 1.0;
 
 #[derive(Debug, Deserialize)]
@@ -121,6 +122,7 @@ impl FittedCamera {
     }
 
     fn camera(&self, intrinsics: Intrinsics) -> anyhow::Result<Camera> {
+        // nalgebra's `From` takes columns, so the rows are transposed.
         let camera_from_world = Matrix3::from(self.R_world_to_cam).transpose();
         let pose = Pose::new(camera_from_world.transpose(), Point3::from(self.centre_enu_m))?;
         Ok(Camera::new(intrinsics, pose)?)

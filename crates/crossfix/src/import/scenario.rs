@@ -69,6 +69,7 @@ pub fn read(dir: &Path) -> anyhow::Result<Vec<Entry>> {
 fn calibration(site: &SiteName, camera: &ScenarioCamera) -> anyhow::Result<Entry> {
     let name = name_of(camera.id)?;
     let rows = Matrix3::from(camera.R_world_from_cam).transpose();
+    // The format's x and y axes point left and up, an image's right and down.
     let axes = rows * Matrix3::from_diagonal(&Vector3::new(-1.0, -1.0, 1.0));
     let pose = Pose::new(axes, Point3::from(camera.pos))
         .with_context(|| format!("camera {}", camera.id))?;

@@ -26,20 +26,24 @@ const ASKED_EVERY: Duration = Duration::from_millis(100);
 /// Longest time from an exposure through encoder, network and decoder to its image here. If a
 /// camera takes longer, images of a turn are attributed to the place where the turn ended.
 const IMAGE_COMES_WITHIN: Duration = Duration::from_millis(500);
-/// A report older than this no longer tells where the mount is.
+/// A report older than this no longer tells where the mount is. With half of it an answer that
+/// takes half a second leaves images without a direction; with twice as much a mount that answers
+/// no more still gives them one for two seconds.
 const SAID_HOLDS: Duration = Duration::from_secs(1);
 /// If the mount has not moved this long after an order, it is taken to have gone as far as it can.
+/// With half of it one that takes longer to begin would be told again.
 const BEGINS_WITHIN: Duration = Duration::from_secs(1);
 /// A mount that has refused to turn is not asked again for this long, so that its camera can see
-/// meanwhile.
+/// meanwhile. With half of it the camera would be kept from seeing twice as often.
 const ASKED_TO_TURN_AGAIN: Duration = Duration::from_secs(5);
 /// Positions within this many SDs of the angles count as the same: it has arrived, or stands still.
+/// With half of it noise in its reports may keep it from ever standing still.
 const SAME_SDS: f64 = 3.0;
 /// Zooms that differ by more than this are different: on most lenses a hundredth is also one of
-/// focal length.
+/// focal length. With twice as much images of a lens with another focal length would be used.
 const SAME_ZOOM: f32 = 0.01;
 /// First and longest pause before a failed request is repeated: some cameras lock out a client that
-/// fails too often.
+/// fails too often. With twice the longest a mount that is back may be unknown for two minutes.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 

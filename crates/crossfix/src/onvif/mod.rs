@@ -17,9 +17,11 @@ use url::Url;
 pub use head::OnvifMount;
 use transport::ToCamera;
 
-/// A camera that does not answer within this time is taken to be absent.
+/// A camera that does not answer within this time is taken to be absent. With half of it those that
+/// take two seconds for an answer would be.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(3);
-/// Most characters of a camera's own text that are shown.
+/// Most characters of a camera's own text that are shown. With half as many a long fault loses its
+/// end.
 const MOST_LETTERS: usize = 200;
 
 /// A camera that has answered what services it has.

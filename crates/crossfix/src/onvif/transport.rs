@@ -13,7 +13,7 @@ use reqwest::{Client, Response};
 /// of it. With half of it some would be refused; without a bound a camera could fill the memory.
 const LONGEST: usize = 256 << 10;
 /// Deepest nesting of an answer: ONVIF's own is about fifteen. The parser uses some stack for each
-/// level.
+/// level. With half of it the same.
 const DEEPEST: usize = 64;
 
 /// HTTP to a camera.

@@ -8,7 +8,8 @@ use nalgebra::{
 };
 
 /// Least eigenvalue of scaled information (its diagonal is one, so that they have the mean one):
-/// below it the information is singular but for rounding.
+/// below it the information is singular but for rounding. Rounding errs by some 1e-15, so half of
+/// it gives the same.
 const SINGULAR: f64 = 1e-12;
 
 /// Geometry of a sight line to a target: its direction, the tangents across it, its length. World,
@@ -49,8 +50,8 @@ impl LineGeometry {
         self.tangents.transpose() / self.range_m
     }
 
-    /// Derivative of the bearing by the camera's pose, as that of `geometry`'s bearing model: a turn (rad), `E' [u]x`
-    /// with u the direction, and a displacement (m), `-E' / r`.
+    /// Derivative of the bearing by the camera's pose, as that of `geometry`'s bearing model: a
+    /// turn (rad), `E' [u]x` with u the direction, and a displacement (m), `-E' / r`.
     fn by_errors(&self) -> Matrix2x6<f64> {
         let turn = self.tangents.transpose() * self.direction.cross_matrix();
         let displacement = self.by_displacement();
@@ -410,7 +411,8 @@ mod tests {
     }
 
     proptest! {
-        /// A camera that is turned and moved so that the target seems to stay errs by nothing, and not twice.
+        /// A camera that is turned and moved so that the target seems to stay errs by nothing, and
+        /// not twice.
         #[test]
         fn errors_of_a_pose_are_those_of_the_bearing_model(x in -80.0..80.0, y in 20.0..150.0, z in -40.0..40.0) {
             let target = Point3::new(x, y, z);

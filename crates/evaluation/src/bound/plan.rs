@@ -10,6 +10,8 @@ use super::{
 };
 
 /// A fix is degenerate if its worst axis has a deviation more than this many times its best one's.
+/// Two like cameras at one range have that ratio where their lines cross at 11 degrees; with half
+/// of it, 23 degrees would count as degenerate.
 pub const DEGENERATE_RATIO: f64 = 10.0;
 
 /// A camera at a place where it stands or might stand.

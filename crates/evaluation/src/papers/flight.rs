@@ -10,9 +10,11 @@ use super::runs::Noise;
 
 /// Time between images in the papers ("tact"), s.
 pub(crate) const TACT: f64 = 1.0 / 30.0;
-/// Standard deviation of the places given to a tracker, about the true ones, px.
+/// Standard deviation of the places given to a tracker, about the true ones, px. The tracker is
+/// told it, so that its covariance is true from the start; with half of it the same.
 const GIVEN_SD: f64 = 0.02;
-/// Sides of the pictures, px.
+/// Sides of the pictures, px. The straight flights end at 590 px; with half of it they would leave
+/// the picture.
 const SIDE: usize = 640;
 /// Frames of a flight (Herasymenko 2021, section 3).
 pub(crate) const FRAMES: usize = 20;

@@ -13,6 +13,7 @@ const SIDES: [usize; 2] = [25, 15];
 const SIGMA_N: f64 = 0.25;
 const FRAMES: usize = 100;
 /// The runs are divided by this: a flight of this experiment is five times as long as the papers'.
+/// With half of it the experiment takes twice as long.
 const RUNS_SHARE: usize = 4;
 
 /// What happens to the target in a flight.

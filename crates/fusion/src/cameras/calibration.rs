@@ -9,7 +9,8 @@ use nalgebra::{Matrix6, Point3};
 use crate::uncertainty::{CameraUncertainty, CorrelatedNoise, PoseUncertainty};
 
 /// Most calibrations of a camera that wait for their time. A camera that is moved by hand has one
-/// at most; of a clock that runs wild, those that lie farthest in the future are forgotten.
+/// at most; of a clock that runs wild, those that lie farthest in the future are forgotten. With
+/// half of it a camera whose moves are announced in advance loses the fifth and those after it.
 const MAX_UPCOMING: usize = 8;
 
 /// A camera as its calibration describes it.

@@ -6,18 +6,20 @@ use crossfix_message::Timestamp;
 
 use super::KnownCamera;
 
-/// Time over which a camera's number of unassigned bearings is averaged, in units of the time for which a
-/// bearing holds a track.
+/// Time over which a camera's number of unassigned bearings is averaged, in units of the time for
+/// which a bearing holds a track. With twice as much a flock of birds that has passed makes every
+/// bearing count less for twice as long.
 const MEMORY: f64 = 2.0;
-/// Unassigned bearings per exposure that are added to the mean: clutter may always be there, however
-/// little was seen.
+/// Unassigned bearings per exposure that are added to the mean: clutter may always be there,
+/// however little was seen. With half of it a bearing of a camera that has seen no clutter counts
+/// for 0.7 more (ln 2) in a log-likelihood ratio.
 const LEAST_PER_EXPOSURE: f64 = 0.02;
 /// Least solid angle of an image, sr: a microradian squared, which keeps densities finite for any
-/// lens.
+/// lens. With half of it the same.
 const LEAST_VIEW_SR: f64 = 1e-12;
 
-/// Running mean of the number of a camera's bearings in an exposure that belong to no track that two
-/// cameras support, with the time of the last exposure; nothing before the first.
+/// Running mean of the number of a camera's bearings in an exposure that belong to no track that
+/// two cameras support, with the time of the last exposure; nothing before the first.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct ClutterRate(Option<(Timestamp, f64)>);
 

@@ -50,16 +50,19 @@ pub use standing::CameraStanding;
 pub(crate) use standing::{Fitting, Fittings};
 pub use watch::PoseFinding;
 
-/// A camera whose noise variance is this many times the reported one is doubted.
+/// A camera whose noise variance is this many times the reported one is doubted. Only its standing
+/// says so, as the noise is counted anyway: with half of it every camera that is found to be
+/// noisier than reported, by however little, would be doubted.
 const DOUBTED_NOISE: f64 = 2.0;
 /// A clock whose variance (logarithm) and offset (in its deviations) change by less than this
-/// changes no track.
+/// changes no track. With half of it tracks are told up to twice as often, and as often the watch
+/// for moved cameras forgets what it knows of the clock.
 const NOTICED_CLOCK: f64 = 0.1;
 /// Variance ratio that another clock has to the one before: so large that what a track has learnt
-/// of the one says nothing of the other.
+/// of the one says nothing of the other. With half of it the same.
 const ANOTHER_CLOCK: f64 = 1e24;
 /// A clock whose deviation is less than this is right, s: times are counted in nanoseconds, and
-/// nothing must be divided by so small a deviation.
+/// nothing must be divided by so small a deviation. With half of it the same.
 const RIGHT_CLOCK_S: f64 = 1e-9;
 
 /// The clock as the tracks were told of it: its source, its deviation and its offset, s.

@@ -3,10 +3,10 @@
 //!
 //! In the third difference of four bearings of one target its direction, its rate and its turning
 //! cancel, and whatever pose, clock and slow errors shift all four by. What is left of four
-//! successive bearings is four draws of white noise. Of four bearings that are a quarter of a second
-//! apart there is left, in addition, what a lasting error changes by within that time. So the two
-//! together tell the white part of a camera's noise from the lasting part, whatever the track
-//! believes.
+//! successive bearings is four draws of white noise. Of four bearings that are a quarter of a
+//! second apart there is left, in addition, what a lasting error changes by within that time. So
+//! the two together tell the white part of a camera's noise from the lasting part, whatever the
+//! track believes.
 
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
@@ -28,10 +28,11 @@ const ERROR_OF_ONE: f64 = 1.9;
 /// its word. With half as many one in four is doubted by chance before its first two hundred draws
 /// are over.
 const DOUBT: f64 = 3.0;
-/// A camera's reported variance is divided into parts if its white noise is this many standard errors
-/// below it. More than for doubt: white noise as reported, looked at thirty times a second, is four
-/// below it by chance once in a few minutes, and would be taken for noise that lasts. With half of it
-/// that happens all the time; at twice as much a camera half of whose variance lasts is left as it is.
+/// A camera's reported variance is divided into parts if its white noise is this many standard
+/// errors below it. More than for doubt: white noise as reported, looked at thirty times a second,
+/// is four below it by chance once in a few minutes, and would be taken for noise that lasts. With
+/// half of it that happens all the time; at twice as much a camera half of whose variance lasts is
+/// left as it is.
 const DIVIDED: f64 = 4.5;
 /// The least share of the reported variance that counts as white. Labels that are interpolated, and
 /// trackers that smooth, have none at all; with a tenth of this their bearings would be believed
@@ -89,9 +90,9 @@ impl RecentBearings {
 struct LastThree([Option<(Timestamp, Unit<Vector3<f64>>)>; 3]);
 
 impl LastThree {
-    /// Takes in a bearing if it is at least `least_s` later than the one before; returns the squared
-    /// third difference of it and the three before, over its variance by the reported noise, provided
-    /// that no two successive ones are more than `longest_s` apart.
+    /// Takes in a bearing if it is at least `least_s` later than the one before; returns the
+    /// squared third difference of it and the three before, over its variance by the reported
+    /// noise, provided that no two successive ones are more than `longest_s` apart.
     fn see(
         &mut self,
         time: Timestamp,
@@ -199,8 +200,8 @@ impl BearingNoise {
     pub(crate) fn lasting(&self) -> CorrelatedNoise {
         let white = self.white();
         // The third difference of a process of variance c^2 with the correlations p, p^2, p^3
-        // between four values has the variance c^2 (20 - 30 p + 12 p^2 - 2 p^3); of white noise w it
-        // has 20 w.
+        // between four values has the variance c^2 (20 - 30 p + 12 p^2 - 2 p^3); of white noise w
+        // it has 20 w.
         let kept = (-SPACING_S / LASTING_S).exp();
         let share = 1.0 - 1.5 * kept + 0.6 * kept.powi(2) - 0.1 * kept.powi(3);
         let changing = (self.spaced.most() - white).max(0.0) / share;
@@ -220,8 +221,8 @@ mod tests {
 
     const REPORTED_SD_RAD: f64 = 5e-4;
 
-    /// What is found of a camera's noise in two minutes at 30 Hz, where its bearings have this white
-    /// and this lasting variance in units of the reported one; the lasting error has this
+    /// What is found of a camera's noise in two minutes at 30 Hz, where its bearings have this
+    /// white and this lasting variance in units of the reported one; the lasting error has this
     /// correlation time, and the target turns by 0.1 rad/s.
     fn found(seed: u64, [white, lasting]: [f64; 2], time_s: f64) -> BearingNoise {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);

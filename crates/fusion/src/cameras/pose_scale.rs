@@ -19,28 +19,33 @@ use super::Cameras;
 const DRAW_SHARE: f64 = 0.1;
 /// Weight of the site's typical factor in the estimate of a camera's own, in degrees of freedom: a
 /// draw has two, less what the target's place takes of them, and a pose errs once, however many
-/// draws show it. Cameras of one site have been surveyed alike. Without it two of four cameras would
-/// be taken to be perfect, and the others to be worse than they are: the lines tell of fewer errors
-/// than there are. With 0.5 a camera that is off by 0.2 degrees draws the others with it.
+/// draws show it. Cameras of one site have been surveyed alike. Without it two of four cameras
+/// would be taken to be perfect, and the others to be worse than they are: the lines tell of fewer
+/// errors than there are. With 0.5 a camera that is off by 0.2 degrees draws the others with it.
 const TYPICAL_WEIGHT: f64 = 0.2;
 /// Largest change of a factor (variance) in one step, so that a camera that is knocked is
 /// recognised in two seconds. With half of it that takes five, with twice as much one wrong start
 /// doubts a good camera.
 const LARGEST_STEP: f64 = 2.5;
 /// A draw counts as no more than this many times its expectation: a target whose bearings were
-/// mixed up with another's for a moment must not be remembered for ten draws.
+/// mixed up with another's for a moment must not be remembered for ten draws. With half of it the
+/// first draw after a knock raises the factor to 1.5 times at most, and not to twice.
 const MOST_OF_A_DRAW: f64 = 30.0;
 /// Least factor (variance) on a careful survey's pose covariance: a microradian, which keeps
 /// covariances regular. With ten microradians tracks seen from kilometres away claimed to know half
 /// of what they did.
 const LEAST: f64 = 1e-6;
-/// Largest factor (variance): a pose that is worse is no pose.
+/// Largest factor (variance): a pose that is worse is no pose. On a careful survey's milliradian it
+/// is a radian. With half of it the same.
 const MOST: f64 = 1e6;
-/// Largest factor (variance) on a pose that is declared.
+/// Largest factor (variance) on a pose that is declared. With half of it a camera that errs by
+/// twice what it declares is taken to err by 1.4 times that, and draws targets towards its lines.
 const DECLARED_MOST: f64 = 4.0;
 /// A camera whose errors are more than this many times (variance) the declared ones is doubted.
+/// With half of it one that errs by more than 2.1 deviations is, and not only by more than 3.
 const DOUBTED: f64 = 9.0;
-/// Changes of an estimate (logarithm) by less than this change no track.
+/// Changes of an estimate (logarithm) by less than this change no track. With half of it tracks are
+/// told up to twice as often, and gain nothing: it is 5 % of a deviation.
 const NOTICED: f64 = 0.1;
 
 /// What a camera has seen of a target during one draw.

@@ -6,23 +6,32 @@ use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector3};
 
-/// How far a rooted object sways about its middle, rad: a tree of 2 m in the wind at 150 m.
+/// How far a rooted object sways about its middle, rad: a tree of 2 m in the wind at 150 m. With
+/// half of it such a tree leaves its place at each sway and passes for something new; with twice as
+/// much a target that crosses there at 3 m/s may count as rooted.
 const REACH_RAD: f64 = 0.015;
 /// Time constant with which the middle follows the swaying object, in units of the time after which
-/// an object is rooted: a few periods of a tree.
+/// an object is rooted: a few periods of a tree. With half of it the middle takes up twice as much
+/// of each sway, and more trees pass for something that flies.
 const MIDDLE: f64 = 2.0;
-/// Least share of the exposures in which a rooted object is reported.
+/// Least share of the exposures in which a rooted object is reported. With half of it what falls
+/// into one place in every sixth exposure by chance is taken for a tree; with twice as much a tree
+/// seen in every second one is not.
 const LEAST_SHARE: f64 = 0.3;
-/// A place that has not been reported for this many times that time is forgotten.
+/// A place that has not been reported for this many times that time is forgotten. With half of it a
+/// light that goes out for six seconds, where that time is 1.5 s, comes back as something new.
 const FORGOTTEN: f64 = 7.0;
 /// A place reported in a smaller share of the exposures since its first report is clutter and not
 /// remembered: of clutter there is no end. With half of it twice as many places are searched for
 /// each bearing; ten times as much would forget what is seldom detected.
 const CLUTTER_SHARE: f64 = 0.03;
 /// An object first reported within this share of that time after a camera's first exposure may have
-/// been there before.
+/// been there before. An object seen in three exposures of ten, at 30 a second, appears later than
+/// that (0.3 s of 1.5) in one case of 25; with half of it in one of six.
 const BEGINNING: f64 = 0.2;
 /// Most places that are remembered of a camera, the latest ones: clutter cannot fill the memory.
+/// With half of it a view of more than 500 leaves and lights takes those it has known longest for
+/// new ones.
 const MAX_PLACES: usize = 1_000;
 
 /// Whether a bearing is of something that stands in its camera's view for good.

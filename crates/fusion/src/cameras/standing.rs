@@ -9,16 +9,22 @@
 use crossfix_message::Timestamp;
 
 /// Memory of the evidence on a camera, s: long enough for a bird beside a target to pass, short
-/// enough for a camera that has been put right to come back.
+/// enough for a camera that has been put right to come back. With half of it the evidence never
+/// reaches [`LEAST_EVIDENCE_S`], and no camera is ever left out.
 const MEMORY_S: f64 = 5.0;
-/// Least evidence for a verdict, s.
+/// Least evidence for a verdict, s. With half of it a bird that is taken for the target for a
+/// second and a half has a camera left out.
 const LEAST_EVIDENCE_S: f64 = 3.0;
 /// A camera is left out when it misses the targets, or its frames are refused, in more than this
-/// share of the time.
+/// share of the time. With half of it, next to [`RETURN`], a camera that misses in every third
+/// exposure comes and goes.
 const EXCLUSION: f64 = 0.7;
-/// It comes back when that share falls below this.
+/// It comes back when that share falls below this. With half of it a camera that was always wrong
+/// and has been put right comes back after nine seconds, and not after six.
 const RETURN: f64 = 0.3;
-/// Longest time that the step from one frame to the next counts, s.
+/// Longest time that the step from one frame to the next counts, s. With half of it a camera of one
+/// frame a second gathers its evidence in twice the time; with twice as much, two frames after
+/// pauses would be a verdict.
 const LONGEST_STEP_S: f64 = 1.0;
 
 /// How far a camera is believed.

@@ -20,30 +20,34 @@ use super::{Cameras, ScaleSample};
 /// longer time to be sure.
 const MEMORIES_S: [f64; 2] = [20.0, 100.0];
 /// Longest time that counts between two successive draws, s: in a pause without a target nothing is
-/// learnt.
+/// learnt. With half of it the same: a draw lasts a third of a second.
 const LONGEST_DRAW_S: f64 = 1.0;
 /// Standard deviations of the turn of a camera that is moved, rad per axis, each as likely: a mast
 /// that settles, a gust, a hand, a fall. With the largest alone a turn of two milliradians would be
 /// less likely by a hundred times.
 const KNOCKS_RAD: [f64; 4] = [1e-3, 3e-3, 1e-2, 3e-2];
-/// Least deviation of a pose's rotation, rad: 0.1 mrad is what a mast does in the sun.
+/// Least deviation of a pose's rotation, rad: 0.1 mrad is what a mast does in the sun. With half of
+/// it the sun would move cameras whose pose is declared exact.
 const LEAST_TURN_RAD: f64 = 1e-4;
 /// Least deviation of its position, m. Where an exact pose is declared, nothing else would allow
 /// for the errors that a lens leaves.
 const LEAST_SHIFT_M: f64 = 2e-3;
 /// Degrees of freedom of Student's t: lines that miss each other by far more than anything explains
-/// are of two targets, and have the weight that this distribution gives them.
+/// are of two targets, and have the weight that this distribution gives them. With half of it such
+/// lines count a quarter less.
 const FREEDOM: f64 = 4.0;
 /// A camera is said to have been moved if the lines are this many times (logarithm) more likely by
-/// it: a thousand times, as one of a site's is moved about once in so many minutes, a day. Of the 62
-/// ways of taking two, three, four or six cameras of the real flights, two name one that stands
+/// it: a thousand times, as one of a site's is moved about once in so many minutes, a day. Of the
+/// 62 ways of taking two, three, four or six cameras of the real flights, two name one that stands
 /// where it stood. With clocks declared exact that were off by up to a tenth of a second, 39 did.
+/// With half of it 30 times would do, against odds of a thousand.
 const SURE: f64 = 6.9;
 /// Another camera may have been moved in its place unless that is less likely by more than this
-/// (logarithm): one in a hundred.
+/// (logarithm): one in a hundred. With half of it one that is ten times less likely is cleared.
 const DISTINCT: f64 = 4.6;
 
-/// Information on errors, in units of their own deviations, that is next to none.
+/// Information on errors, in units of their own deviations, that is next to none. With half of it
+/// the same.
 const UNSEEN: f64 = 1e-9;
 /// Fewer cameras do not check one another: an error in the plane of two sight lines shows in
 /// neither.
@@ -311,8 +315,7 @@ impl ErrorWatch {
         // Weights by noise alone, and by noise and the errors that poses may have.
         let weights = samples.iter().map(|sample| sample.slow_noise.try_inverse());
         let weights: Vec<_> = weights.collect::<Option<_>>()?;
-        // The misfit is judged with the pose errors allowed: a camera that is off is no reason to
-        // doubt the target.
+        // The misfit allows for pose errors: a camera that is off is no reason to doubt the target.
         let loose = samples
             .iter()
             .zip(&by_errors)

@@ -8,22 +8,28 @@ use super::curve::{Basis, Curve};
 use super::window::WindowBearing;
 
 /// Squared Mahalanobis distance (two degrees of freedom) beyond which a bearing pulls no harder, in
-/// the first descent, when all may be far off.
+/// the first descent, when all may be far off. With half of it one in ten of the target's own pulls
+/// too little.
 const HUBER: f64 = 9.0;
 /// Squared distance beyond which a bearing does not pull at all, in the later descents: it is a
-/// stranger, of another object (1 in 60 000 of the target's own lies beyond).
+/// stranger, of another object (1 in 60 000 of the target's own lies beyond; with half of it 1 in
+/// 245).
 const OUTLIER: f64 = 22.0;
 /// Median of a squared distance of two degrees of freedom.
 const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
-/// Largest factor on a camera's covariances: larger residuals are due to a mistake, not to noise, and
-/// are not made likely by taking them for noise.
+/// Largest factor on a camera's covariances: larger residuals are due to a mistake, not to noise,
+/// and are not made likely by taking them for noise. With half of it a camera that reports a third
+/// of its noise never has its clock learnt.
 pub(super) const MAX_SCALE: f64 = 16.0;
-/// Most iterations of one descent; most descents take three to six.
+/// Most iterations of one descent, which bounds its time; most take three to six, and half of it
+/// would do for these.
 const MAX_ROUNDS: usize = 25;
 /// Levenberg-Marquardt damping relative to the diagonal: at first, and when a descent is given up.
+/// With half of either the same: it changes by factors of ten.
 const FIRST_DAMPING: f64 = 1e-4;
 const MAX_DAMPING: f64 = 1e4;
 /// A descent has settled when an iteration lowers the sum of squared distances by less than this.
+/// With half of it the same.
 const SETTLED: f64 = 1e-3;
 /// Densities of the jerk that are tried, m^2/s^5, as powers of ten: from a straight line to the
 /// turns of a racing drone.
@@ -122,7 +128,7 @@ pub(super) struct Adjustment<'a> {
     prior: &'a ClockAndPosePrior,
     /// Factor on each camera's covariances.
     scales: Vec<f64>,
-    /// Weight of each camera's bearings: the inverse of the factor by which they repeat one another.
+    /// Weight of each camera's bearings: inverse of the factor by which they repeat one another.
     weights: Vec<f64>,
 }
 
@@ -180,9 +186,8 @@ impl<'a> Adjustment<'a> {
                 (Loss::Huber, Some(median)) => median / MEDIAN,
                 (Loss::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
             };
-            // Up to three standard errors (of the median; four of the mean) above 1 are chance for a camera whose covariances are
-            // right: there the factor stays 1.
-            // The squares were taken with the factor so far.
+            // Up to three standard errors (of the median; four of the mean) above 1 are chance for
+            // a camera whose covariances are right. The squares hold the factor so far.
             let found = typical * *scale;
             let next = if found < 1.0 + 4.0 / count.sqrt() { 1.0 } else { found };
             changed |= (next / *scale - 1.0).abs() > 0.1;
@@ -236,8 +241,8 @@ impl<'a> Adjustment<'a> {
 
     /// The target of a bearing. A clock that is ahead by o shows the target where it was o ago: the
     /// offset moves the place by minus the velocity, the drift by that times the time since the
-    /// epoch. A camera whose stated pose is turned by d and moved by c
-    /// against its true one has the target at p + d x (p - origin) + c.
+    /// epoch. A camera whose stated pose is turned by d and moved by c against its true one has the
+    /// target at p + d x (p - origin) + c.
     fn target(&self, sight: &WindowBearing, state: &WindowState) -> PredictedTarget {
         let (time_s, since) = self.time(sight, &state.cameras);
         let basis = self.curve.basis(time_s);
@@ -385,8 +390,7 @@ impl<'a> Adjustment<'a> {
         let mut information = DMatrix::zeros(points + cameras, points + cameras);
         self.curve.add_prior(&mut information, jerk(density));
         information.view_mut((points, points), (cameras, cameras)).copy_from(&self.prior.precision);
-        // Distance d from the prior's mean, which is 0 for the trajectory: cost d' A d, half
-        // gradient A d.
+        // Distance d from the prior's mean, 0 for the trajectory: cost d' A d, half gradient A d.
         let mut away = DVector::zeros(points + cameras);
         away.rows_mut(0, points).copy_from(&state.coefficients);
         away.rows_mut(points, cameras).copy_from(&(&state.cameras - &self.prior.mean));
@@ -414,8 +418,8 @@ fn outlier_share(squares: &[f64]) -> f64 {
         / squares.len().max(1) as f64
 }
 
-/// Residual of a bearing with the target at a place, in units of its noise; `None` if the place lies
-/// behind the camera.
+/// Residual of a bearing with the target at a place, in units of its noise; `None` if the place
+/// lies behind the camera.
 fn whitened(sight: &WindowBearing, target: Vector3<f64>, scale: f64) -> Option<Vector2<f64>> {
     let residual = sight.line.tangent_offset(target.into())?;
     // z <- L^-1 z, where R = L L'.

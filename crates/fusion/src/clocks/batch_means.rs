@@ -15,8 +15,8 @@ use nalgebra::Vector2;
 /// part: with half of it, errors that last for a second leave clocks off by a half more of their
 /// stated deviations.
 const BATCH_S: f64 = 2.0;
-/// Standard errors above 1 that are chance: there the factor stays 1, in a window of four batches up
-/// to 3. With half as many, a factor in twenty of independent residuals would be above 1.
+/// Standard errors above 1 that are chance: there the factor stays 1, in a window of four batches
+/// up to 3. With half as many, a factor in twenty of independent residuals would be above 1.
 const CHANCE: f64 = 4.0;
 
 /// Sums of a camera's residuals over batches, of their squares, and of their allowances.
@@ -29,8 +29,8 @@ pub(super) struct BatchMeans {
 }
 
 impl BatchMeans {
-    /// Takes in the residual of a bearing at a time (s), in units of the noise that is reckoned with,
-    /// whose variance is `allowance` times that of the bearing alone.
+    /// Takes in the residual of a bearing at a time (s), in units of the noise that is reckoned
+    /// with, whose variance is `allowance` times that of the bearing alone.
     pub(super) fn add(&mut self, time_s: f64, residual: Vector2<f64>, allowance: f64) {
         *self.sums.entry((time_s / BATCH_S).floor() as i64).or_default() += residual;
         self.squares += residual.norm_squared();

@@ -9,18 +9,21 @@ use nalgebra::{DMatrix, DVector, Matrix6};
 use super::ClockEstimate;
 use super::common_time::{ClockReading, Common, LIARS_SD_S, common_time};
 
-/// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
+/// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz. With half of either
+/// the estimates follow a clock a little later.
 const OFFSET_WALK: f64 = 1e-12;
 const DRIFT_WALK: f64 = 1e-16;
-/// No two clocks agree to better than this, s and s/s: it keeps their covariance regular.
+/// No two clocks agree to better than this, s and s/s: it keeps their covariance regular. With half
+/// of it the same.
 const OFFSET_FLOOR_S: f64 = 1e-6;
 const DRIFT_FLOOR: f64 = 1e-9;
-/// The same floor for a pose, rad and m.
+/// The same floor for a pose, rad and m. With half of it the same.
 const POSE_FLOOR: f64 = 1e-6;
 /// Weight of a window in the mean of the latest ones' inflations. With half of it a minute passes
 /// before a change in the bearings' errors shows.
 const INFLATION_WEIGHT: f64 = 0.25;
-/// Offsets are clamped to this, s: beyond it they are no offsets any more.
+/// Offsets are clamped to this, s: beyond it they are no offsets any more. With half of it a clock
+/// that is off by a second and a half stays off by half a second.
 const MAX_OFFSET_S: f64 = 2.0;
 
 /// An uncertain camera pose: index of its error in the state, and its covariance as reported.
@@ -89,11 +92,10 @@ impl Belief {
         let others: Vec<usize> = self.clock_places().collect();
         let place = reference.map(|_| self.grow(2));
         if let (Some(reference), Some(place)) = (reference, place) {
-            // Relative to the reference r, the offset o_k - o_r has the variance v_k + v_r, and v_r
-            // in common with every other.
+            // The offset o_k - o_r from the reference r has the variance v_k + v_r, ...
             let own = [prior + OFFSET_FLOOR_S.powi(2), drift_prior + DRIFT_FLOOR.powi(2)];
             for (i, common) in [reference.prior, reference.drift_prior].into_iter().enumerate() {
-                // The reference's own error is part of every offset from it.
+                // ... of which v_r, the reference's own, is in common with every other offset.
                 for &other in &others {
                     self.covariance[(place + i, other + i)] = common;
                     self.covariance[(other + i, place + i)] = common;
@@ -287,8 +289,7 @@ impl Belief {
         }
         self.forget(camera, deviations);
         if is_reference {
-            // The new reference starts at true time; the offset of the old one from true time goes
-            // into the offsets of all others.
+            // The new reference starts at true time; the old one's offset goes into all others.
             let now = self.reference_offset_and_drift();
             let others: Vec<usize> = self.clock_places().collect();
             for i in 0..2 {
@@ -335,8 +336,7 @@ impl Belief {
             return;
         };
         let Some(place) = clock.place else {
-            // The reference: all other offsets are relative to it, so they share its deviation from
-            // true time.
+            // All other offsets are relative to the reference: they share its deviation.
             let others: Vec<usize> = self.clock_places().collect();
             for (i, variance) in [clock.prior + jumped, clock.drift_prior].into_iter().enumerate() {
                 for (&k, &l) in others.iter().flat_map(|k| others.iter().map(move |l| (k, l))) {
@@ -353,8 +353,7 @@ impl Belief {
             clock.drift_prior + reference.drift_prior + DRIFT_FLOOR.powi(2),
         ];
         for (i, variance) in variances.into_iter().enumerate() {
-            // At true time again: relative to the reference that is minus the reference's own
-            // offset.
+            // At true time again, which lies at minus the reference's own offset from it.
             self.mean[place + i] = -common[i];
             self.covariance.row_mut(place + i).fill(0.0);
             self.covariance.column_mut(place + i).fill(0.0);
@@ -442,7 +441,7 @@ impl Belief {
         row
     }
 
-    /// Whether all offsets are such as clocks may have: beyond [`MAX_OFFSET_S`] a fit has gone astray.
+    /// Whether all offsets are such as clocks may have: beyond [`MAX_OFFSET_S`] a fit went astray.
     pub(super) fn is_possible(&self) -> bool {
         self.clock_places().all(|place| self.mean[place].abs() <= MAX_OFFSET_S)
     }

@@ -14,9 +14,10 @@ use std::f64::consts::PI;
 const LIARS: f64 = 0.01;
 /// Standard deviation of their offsets, s. With half of it the same.
 pub(super) const LIARS_SD_S: f64 = 1.0;
-/// Iterations towards a maximum: they settle in three or four.
+/// Iterations towards a maximum: they settle in three or four, so that half of it would do.
 const STEPS: usize = 10;
-/// Maxima closer to each other than this many standard deviations count as one.
+/// Maxima closer to each other than this many standard deviations count as one. With half of it the
+/// same: climbs to one maximum end much closer to each other.
 const APART: f64 = 0.5;
 
 /// A clock's offset from an arbitrary one of the clocks, s, and its reported variance, s^2.

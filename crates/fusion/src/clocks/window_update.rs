@@ -10,29 +10,42 @@ use super::curve::Curve;
 use super::window::TrackWindow;
 
 /// Least span of a window, and least time for which a camera whose clock has jumped sees the target
-/// together with another, s: bearings of less say nothing that can be checked.
+/// together with another, s: bearings of less say nothing that can be checked. With half of it
+/// there is a single piece of the curve to check the clocks by.
 const LEAST_WINDOW_S: f64 = 1.0;
-/// A camera of which more than this share of bearings are outliers, of other objects, does not fit itself.
+/// A camera of which more than this share of bearings are outliers, of other objects, does not fit
+/// itself. With half of it a bird that is taken for the target in one bearing of six spoils a
+/// window.
 const MAX_OUTLIERS: f64 = 0.3;
 /// Residuals larger than this, or clocks farther than this from their prior (both squared, over
-/// what was expected), may be due to a clock that has jumped.
+/// what was expected), may be due to a clock that has jumped. With half of the first every window
+/// is searched for jumps, in up to six fits more; with half of the second a jump that only the
+/// prior shows is looked for at 0.7 times the size.
 const SUSPICIOUS_SCALE: f64 = 1.5;
 const SUSPICIOUS_PULL: f64 = 6.0;
 /// By how much (twice the logarithm) a jump must make a window likelier: clocks jump once a day.
+/// With half of it a jump would be accepted as if they did every twelve minutes.
 const JUMP: f64 = 18.0;
-/// Cameras that are tried for a jump, the least fitting first.
+/// Cameras that are tried for a jump, the least fitting first. With half of it a jump of the third
+/// is not found; each more costs a fit.
 const MAX_SUSPECTS: usize = 4;
 /// Bearings of a camera that fit better than all of its bearings by this factor (squared) are taken
-/// after a jump.
+/// after a jump. With half of it they need not even fit as well, and any poor fit may pass for a
+/// jump.
 const BETTER: f64 = 1.5;
 /// Longest margin of a curve beyond its bearings, s: the margin is as far as the clocks may move.
+/// With half of it the bearings of a clock that is off by a second lie beyond the curve, where its
+/// end pieces are only continued.
 const MAX_MARGIN_S: f64 = 1.0;
-/// Longest window, s: it bounds the number of a curve's pieces.
+/// Longest window, s: it bounds the number of a curve's pieces. With half of it the last bearings
+/// of a full window, of 8 s and its margins, lie beyond the curve.
 const LONGEST_S: f64 = 12.0;
-/// Jerk density that is tried first, m^2/s^5, as a power of ten.
+/// Jerk density that is tried first, m^2/s^5, as a power of ten. Each power between it and the best
+/// one costs a descent.
 const FIRST_DENSITY: i32 = 0;
 
-/// Difference of evidence (twice the logarithm) that is as good as none.
+/// Difference of evidence (twice the logarithm) that is as good as none. With half of it more jumps
+/// of clocks of which little was known are overlooked by chance.
 const EVEN: f64 = 1.0;
 
 /// Result of a window.
@@ -197,8 +210,8 @@ impl JumpTest<'_> {
     /// The fit of a window after a jump of a camera's clock; `None` if it does not fit then either.
     ///
     /// The evidences are compared with the noise that the jump leaves: one that explains a few of
-    /// the errors that last, by chance, gains little, and nothing is deducted from one that explains
-    /// them all.
+    /// the errors that last, by chance, gains little, and nothing is deducted from one that
+    /// explains them all.
     fn jump(
         &self,
         camera: &CameraName,
@@ -221,9 +234,9 @@ impl JumpTest<'_> {
         Some(Jump { belief, adjusted, gain, fitted: before.as_ref().is_some_and(fits) })
     }
 
-    /// Whether the belief after a jump of a clock, from the bearings of a window, says by how much it
-    /// has jumped. Where the bearings of a camera are moved to a time at which no other camera sees
-    /// the target, they fit whatever they are, and tell nothing of their clock.
+    /// Whether the belief after a jump of a clock, from the bearings of a window, says by how much
+    /// it has jumped. Where the bearings of a camera are moved to a time at which no other camera
+    /// sees the target, they fit whatever they are, and tell nothing of their clock.
     fn shows_jump(&self, camera: &CameraName, window: &TrackWindow, jumped: &Belief) -> bool {
         let of = |belief: &Belief, camera| belief.estimate(camera, self.now);
         let (Some(before), Some(after)) = (of(&self.belief, camera), of(jumped, camera)) else {

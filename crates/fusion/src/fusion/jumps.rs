@@ -12,10 +12,11 @@ use crate::unmet::Unmet;
 
 /// All clocks are taken to have stepped forward, rather than the cameras to have stood still, if
 /// the targets' bearings make that likelier by this log-likelihood ratio: a host that slept is the
-/// commoner cause.
+/// commoner cause. With half of it a likelihood ratio of 55 would do, and not of 3000.
 const STEP_MARGIN: f64 = 8.0;
 /// A longer step forward cannot be told from a host that slept, s: after that nobody knows where a
-/// target is.
+/// target is. With half of it a step of a second and a half moves all tracks on by so much, away
+/// from their targets.
 const LONGEST_FORWARD_S: f64 = 2.0;
 
 impl Fusion {

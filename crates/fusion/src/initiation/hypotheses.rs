@@ -20,20 +20,26 @@ use crate::uncertainty::CameraUncertainty;
 use crate::visibility::log_missed;
 use crate::{Exposure, FusionConfig, Tracking};
 
-/// Most bearings of one exposure with which one hypothesis is continued, the best first.
+/// Most bearings of one exposure with which one hypothesis is continued, the best first. With one
+/// alone, a stranger (a bearing of something else) that fits better takes the target's place.
 const MAX_BRANCHES: usize = 3;
-/// Most hypotheses kept of one tree.
+/// Most hypotheses kept of one tree. One exposure makes at most four of each: this holds three
+/// exposures in full, half of it two.
 const MAX_FAMILY: usize = 100;
-/// Most hypotheses kept of those with the same lines in the newest period.
+/// Most hypotheses kept of those with the same lines in the newest period. With half of it the
+/// right past may be given up before later periods tell it apart.
 const MAX_ALIKE: usize = 20;
-/// A hypothesis less likely than its tree's best by this log-likelihood is given up.
+/// A hypothesis less likely than its tree's best by this log-likelihood is given up. With half of
+/// it a wrong branch that is ahead by eight can no longer be overtaken.
 const FAMILY_MARGIN: f64 = 15.0;
-/// A hypothesis with a smaller log-likelihood ratio than this is clutter.
+/// A hypothesis with a smaller log-likelihood ratio than this is clutter. A seed of two cameras may
+/// begin below zero: with half of it the first misses end a new target there.
 const LEAST_SCORE: f64 = -12.0;
 /// While another explanation of the same bearings is within this log-likelihood of the best (a
-/// chance of 1 in 3000), nothing is confirmed.
+/// chance of 1 in 3000), nothing is confirmed. With half of it (1 in 50) ghosts are confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
-/// Most hypotheses at a time, the best ones: memory is bounded however much clutter there is.
+/// Most hypotheses at a time, the best ones: memory is bounded however much clutter there is. With
+/// half of it, in such clutter, the youngest targets go first.
 const MAX_HYPOTHESES: usize = 6_000;
 
 /// One hypothesis: that these bearings are one target's.
@@ -88,9 +94,9 @@ impl Hypothesis {
         self.lines.iter().map(|(_, (camera, ..))| camera).collect()
     }
 
-    /// Whether what stands in the cameras' views explains it: but for one camera at most, whose line
-    /// may be clutter (of two cameras, but for none). As long as this is unknown of a line (its
-    /// camera has only begun to look), two cameras are not enough.
+    /// Whether what stands in the cameras' views explains it: but for one camera at most, whose
+    /// line may be clutter (of two cameras, but for none). As long as this is unknown of a line
+    /// (its camera has only begun to look), two cameras are not enough.
     fn stands(&self) -> bool {
         let cameras = self.cameras();
         let newest = || self.rooted.iter().filter(|(camera, _)| cameras.contains(camera));
@@ -105,10 +111,10 @@ impl Hypothesis {
     /// Least log-likelihood ratio of one target against an object per camera with which it is
     /// confirmed: the logarithm of the number of sets of lines that it may have been chosen from by
     /// chance, the product of the numbers of its cameras' lines. What stands in a view is counted
-    /// where the hypothesis has such a line, but not for two cameras, of which one line at least does
-    /// not stand: a target that flies slowly passes for standing before one of them, and would be
-    /// found ten seconds later. If none of its lines has been seen to come or to move, all may stand,
-    /// and it needs as much more as against any other rival.
+    /// where the hypothesis has such a line, but not for two cameras, of which one line at least
+    /// does not stand: a target that flies slowly passes for standing before one of them, and would
+    /// be found ten seconds later. If none of its lines has been seen to come or to move, all may
+    /// stand, and it needs as much more as against any other rival.
     fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
         let cameras = self.cameras();
         let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
@@ -475,8 +481,8 @@ impl Hypotheses {
     }
 }
 
-/// Number of lines of each camera in an exposure, the largest of the period: all, and those of which
-/// it is not known that they are of something that stands in its view.
+/// Number of lines of each camera in an exposure, the largest of the period: all, and those of
+/// which it is not known that they are of something that stands in its view.
 fn numbers_of_lines<'a>(exposures: &[&'a Exposure]) -> BTreeMap<&'a CameraName, [usize; 2]> {
     let mut lines: BTreeMap<&CameraName, [usize; 2]> = BTreeMap::new();
     for exposure in exposures {

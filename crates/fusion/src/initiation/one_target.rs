@@ -10,10 +10,12 @@ use crate::spatial::TYPICAL_SPEED;
 use crate::visibility::independent_share;
 
 /// Logarithm of the probability that a camera never detects a target that it should see: the most
-/// that its misses count.
+/// that its misses count. With half of it the second look of a camera that sees nothing no longer
+/// counts; with twice as much a target that a tree hides from one camera is found later.
 const LOG_NEVER_DETECTED: f64 = -4.6;
 /// If the clock's uncertainty shifts a camera's bearings by a variance of more than this many times
-/// their own, the test says nothing.
+/// their own, the test says nothing. With half of it clocks that are 0.7 times as uncertain let
+/// lines that cross by chance pass untested.
 const INCONCLUSIVE: f64 = 10.0;
 
 /// Log-likelihood ratio of all lines being one target's against every camera seeing a target of its

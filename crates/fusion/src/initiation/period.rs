@@ -5,12 +5,15 @@ use crossfix_message::{CameraName, Timestamp};
 use crate::Exposure;
 
 /// A camera counts as silent if its newest exposure is older than this many frame intervals (the
-/// median over the cameras).
+/// median over the cameras). With half of it a camera that skips two frames counts as silent; with
+/// twice as much the others wait twice as long for one that has died.
 const SILENT_INTERVALS: f64 = 5.0;
 /// A period is closed when the exposures lie within this factor of the smallest spread seen lately.
+/// Nearer to 1, frames that jitter keep a period open for another round.
 const SPREAD_FACTOR: f64 = 1.2;
 
-/// Weight of the last frame interval in the running mean of a camera's frame interval.
+/// Weight of the last frame interval in the running mean of a camera's frame interval. With half of
+/// it a new frame rate is learnt in ten frames and not in five.
 const INTERVAL_RATE: f64 = 0.2;
 
 /// A camera that sends exposures at present.

@@ -14,21 +14,28 @@ use crate::prediction::BearingPrediction;
 use crate::spatial::{LineId, MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::{Exposure, FusionConfig, Initiation};
 
-/// Most lines of one camera that are tried as an addition to a pair, the best first.
+/// Most lines of one camera that are tried as an addition to a pair, the best first. With half of
+/// it a camera whose line of the target is the third best is left out of its seed.
 const MAX_BRANCHES: usize = 5;
-/// Lines that are part of a set of at least this many cameras need not be tried in other sets.
+/// Lines that are part of a set of at least this many cameras need not be tried in other sets. With
+/// half of it two lines that cross by chance keep the true set from being tried.
 const SETTLED_CAMERAS: usize = 4;
 /// Most seeds kept of one period, the likeliest ones: memory is bounded however much clutter there
-/// is.
+/// is. With half of it a target of the less likely half waits for the next period.
 const MAX_SEEDS: usize = 2_000;
-/// The set gates are computed for sets of fewer cameras than this; larger sets pass.
+/// The set gates are computed for sets of fewer cameras than this; larger sets pass. With half of
+/// it sets of 32 cameras pass whatever their residuals are.
 const MAX_CAMERAS: usize = 64;
-/// Most pairs of closely passing lines that are extended in one period: time is bounded.
+/// Most pairs of closely passing lines that are extended in one period: time is bounded. Beyond it
+/// the pairs of cameras that look most nearly along one line are left out; with half of it that
+/// happens with fewer bearings.
 const MAX_CLOSE_PAIRS: usize = 20_000;
 /// Once more seeds than this have been found, no more pairs are tried: if many bearings are alike,
-/// every combination of them is as good as any other.
+/// every combination of them is as good as any other. Half of it is still five times [`MAX_SEEDS`].
 const MAX_FOUND: usize = 20_000;
 /// Most pairs of lines tried for two cameras: time is bounded, whatever a camera reports.
+/// [`MAX_LINES`](super::MAX_LINES) against as many: with half of it the later lines of a full
+/// exposure begin no pair.
 const MAX_PAIRS: usize = 250_000;
 
 /// Up to this distance from the nearest camera new targets are as dense as `birth_density_per_m3`

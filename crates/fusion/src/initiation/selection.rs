@@ -7,9 +7,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::spatial::LineId;
 
 /// Most comparisons of leaves in one period, about a tenth of a second's worth; half of them are
-/// reserved for [`Selection::loss_without`], the question how sure each choice is.
+/// reserved for [`Selection::loss_without`], the question how sure each choice is. What they do not
+/// suffice for is not confirmed in that period: with half of it that happens in less clutter.
 const MAX_COMPARISONS: usize = 20_000_000;
-/// Most passes of the local search; each increases the total, and few are ever needed.
+/// Most passes of the local search; each increases the total, and few are ever needed. With half of
+/// it the same.
 const MAX_PASSES: usize = 20;
 
 /// Bearings that may be one target's, and their score.

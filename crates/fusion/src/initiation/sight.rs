@@ -10,6 +10,9 @@ use nalgebra::{Matrix2, Unit, Vector3};
 use crate::prediction::{BearingPrediction, Beginning, GivenShift, log_density};
 
 /// Weight of the prior that the noise is as reported, as a number of coordinates (two per bearing).
+/// With half of it a few large innovations make a camera count as noisy, and true differences count
+/// less; with twice as much, noise that is larger than reported passes for evidence for twice as
+/// long.
 const PRIOR_COORDINATES: f64 = 10.0;
 
 /// Filter for the direction in which one camera alone follows a target: a constant turning rate

@@ -37,11 +37,14 @@ use likeness::{Likenesses, NeighbourTrackId};
 /// much a target whose centre has died is gone for twice as long.
 const HEARD_FOR_S: f64 = 1.0;
 /// Tracks are compared this often, s: they move little between, and each costs a pass over all.
+/// With half of it the comparisons cost twice as much and tell no more.
 const COMPARED_EVERY_S: f64 = 0.1;
 /// How long a new track that may be a neighbour's is not said, s: twice what it takes to find out.
-/// Its place is said all the while, by the neighbour.
+/// Its place is said all the while, by the neighbour. With half of it a track that is found out a
+/// little late is said twice, and its second number has to be taken back.
 const HELD_BACK_S: f64 = 2.0;
-/// Most tracks of neighbours that are kept in mind.
+/// Most tracks of neighbours that are kept in mind. Memory is bounded; beyond it a target that
+/// flies in has a second number here.
 const MOST_TRACKS: usize = 10_000;
 
 /// Place of one fusion centre among those of its site.

@@ -33,6 +33,8 @@ pub fn triple_range_covariance(alpha: f64, beta: f64, equation_sd: f64) -> Optio
     let sum = square_a + square_b;
     let both = cos_a * cos_b;
     (sum > f64::EPSILON).then(|| {
+        // (A'A)^-1, where A has the rows r1 a1 - rk ak (k = 2, 3): A'A = [2 -cos a -cos b;
+        // -cos a 1 0; -cos b 0 1], with `sum` as its determinant.
         let shape = Matrix3::new(
             1.0,
             cos_a,

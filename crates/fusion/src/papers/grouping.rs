@@ -15,9 +15,10 @@ use nalgebra::{Point3, Vector3};
 use crate::spatial::{Fix, LineId, TimedLine, VelocityKnowledge};
 
 /// Most groups kept from one period to the next, the best ones: clutter cannot fill the memory.
+/// With half of it a young group of a target is pushed out by half as many groups of clutter.
 const MAX_GROUPS: usize = 5_000;
 /// Most fixes of one period that are grouped, the first ones: with [`MAX_GROUPS`] it bounds the
-/// time.
+/// time. With half of it a target whose fix is the 251st is not found.
 const MAX_FIXES: usize = 500;
 
 /// A fix with the sight lines that it was made of.

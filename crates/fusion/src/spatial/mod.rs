@@ -79,7 +79,8 @@ pub enum VelocityKnowledge {
 /// would meet anywhere.
 pub(crate) const TYPICAL_SPEED: f64 = 0.3;
 
-/// Standard deviation of an uninformative velocity prior, m/s per axis: faster than any UAV.
+/// Standard deviation of an uninformative velocity prior, m/s per axis: faster than any UAV. With
+/// half of it a velocity that bearings determine to between 50 and 100 m/s counts as unobserved.
 pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;
 
 /// The squared Mahalanobis distance within which a true value of `dimensions` lies with probability

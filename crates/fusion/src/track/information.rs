@@ -10,12 +10,15 @@ use crate::spatial::{Observability, VAGUE_VELOCITY_SD};
 use crate::uncertainty::CameraUncertainty;
 
 /// How often a track's observability is computed again, s: the eigenvalues cost more than an
-/// update.
+/// update. With half of it they cost twice as much; with twice as much, what can no longer be
+/// observed is said a second later.
 const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
-/// Time constant with which the Fisher information of past bearings fades, s.
+/// Time constant with which the Fisher information of past bearings fades, s. With half of it the
+/// last bearing but one of a camera of 1 Hz keeps 13 % of its weight and not 37 %; with twice as
+/// much a lost camera counts for twice as long.
 const INFORMATION_S: f64 = 1.0;
 /// Prior scale of the position in the observability test, m: a position counts as observable if it
-/// is known better than this.
+/// is known better than this. With half of it a position known to 15 m no longer counts.
 const POSITION_SCALE_M: f64 = 20.0;
 
 impl Track {

@@ -111,6 +111,7 @@ impl Track {
             .flatten();
         self.detector.as_mut().is_some_and(|detector| match detector {
             ManoeuvreDetector::Residual(detector) => {
+                // In the axes of the world, so that residuals of different cameras can be averaged.
                 detector.see(innovation.model.basis * innovation.offset / line.standard_deviation())
             }
             ManoeuvreDetector::Innovation(detector) => nis.is_some_and(|nis| detector.see(nis, 2)),

@@ -23,7 +23,7 @@ use crate::update::Told;
 /// site of six cameras err by 1 % more.
 const MOST_LEARNT: usize = 8;
 /// After this many decay times of an error nothing is left of what has been learnt of it (e^-5),
-/// and another camera may take its place.
+/// and another camera may take its place. With half of it 8 % is thrown away.
 const FORGOTTEN: f64 = 5.0;
 
 /// L_k: covariance of the learnt errors with the shared errors of one camera.

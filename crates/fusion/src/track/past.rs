@@ -180,6 +180,7 @@ impl Track {
             let interval = to.seconds_since(past.carried_to);
             for (name, own) in &mut past.ties {
                 let Some(ties) = self.ties.get(name) else { continue };
+                // A covariance with an error decays as the error does, by exp(-t / T).
                 let mut lasting = own.fixed_columns_mut::<2>(LASTING);
                 lasting *= ties.kept(interval);
             }

@@ -21,7 +21,8 @@ use crate::visibility::Visibility;
 
 /// Longest interval between bearings whose third difference is used, as a share of the holding time
 /// ([`MotionSetup::holding_s`], how long after a bearing its camera still supports the track): over
-/// longer intervals noise cannot be told from jerk.
+/// longer intervals noise cannot be told from jerk. By default that is 0.15 s: with half of it
+/// cameras of 10 Hz show nothing of their white noise.
 const CLOSE_BEARINGS: f64 = 0.1;
 /// A draw (one comparison of the cameras' mean offsets from the target) lasts this long, s: long
 /// enough for some bearings of each camera, short enough to see a mast sway.
@@ -30,7 +31,8 @@ const DRAW_S: f64 = 0.3;
 /// A camera supports the track for at least this many times the interval between its last two
 /// bearings: the next one may be late, but none may be missed, ...
 const HOLDING_PERIODS: f64 = 1.5;
-/// ... with intervals counted as no longer than this many times the holding time.
+/// ... with intervals counted as no longer than this many times the holding time. With half of it a
+/// camera with a bearing every other holding time loses the target between any two.
 const LONGEST_PERIOD: f64 = 2.0;
 
 /// A camera that has missed the target for no longer than this share of the holding time has not
@@ -43,7 +45,8 @@ const MISSED: f64 = 0.2;
 /// share of the offset, ...
 const STEADY: f64 = 0.2;
 /// ... for this many draws in a row, a second and a half. With half of it, what flies past in the
-/// same direction is taken for the target.
+/// same direction is taken for the target. With half of the share, the track's own wander ends the
+/// row.
 const STEADY_DRAWS: u32 = 5;
 /// At least this many cameras must have it beside the target: a single one may be turned, and it is
 /// for the others to accuse it.
@@ -118,6 +121,7 @@ impl Drawn {
     /// The mean offset as a sample, for a target whose velocity has a standard deviation of
     /// `speed`, m/s.
     fn sample(self, camera: &CameraName, speed: f64) -> ScaleSample {
+        // The mean times of the cameras' bearings differ, by a tenth of a draw as assumed here.
         let moved = self.by_position * (speed * DRAW_S / 10.0);
         // White noise averages out over the bearings; what an unknown velocity does within a draw
         // does not.

@@ -14,12 +14,16 @@ use crate::visibility::log_missed;
 use crate::{Exposure, Sighting};
 
 /// A camera's bearings are not compared with tracks farther from it than this many times the
-/// largest range.
+/// largest range. With half of it a target loses its bearings before it leaves that range.
 const REACH: f64 = 1.5;
-/// Upper limit of a track's score: a track that has long been good can still be doubted.
+/// Upper limit of a track's score: a track that has long been good can still be doubted. With half
+/// of it no tentative track reaches the default score of confirmation; with twice as much a ghost
+/// lives for twice as many misses.
 const MAX_SCORE: f64 = 40.0;
 /// Bearings within this angle of a target's expected direction count as beside it, rad: a camera
-/// that is turned by no more than this shows the target there.
+/// that is turned by no more than this shows the target there. With half of it a camera turned by
+/// four degrees is not accused; with twice as much, what else is in the view counts against a good
+/// one.
 const BESIDE_RAD: f64 = 0.1;
 
 impl Tracker {

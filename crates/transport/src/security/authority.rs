@@ -17,11 +17,12 @@ use super::credentials::common_name;
 
 /// How long the authority itself is valid. Whoever has its key can join the site, so the key stays
 /// where `enroll` is run; at the authority's end all certificates must be issued again by a new
-/// one.
+/// one. With half of it that is due after five years.
 const AUTHORITY_HOLDS: Duration = Duration::from_secs(10 * 365 * 24 * 3600);
 /// Prefix of the site's name in the authority's common name.
 const OF_SITE: &str = "Crossfix site ";
-/// How far a host's clock may be behind that of the issuing host.
+/// How far a host's clock may be behind that of the issuing host. With half of it a host that is 30
+/// to 60 minutes behind refuses a new certificate at first.
 const CLOCKS: Duration = Duration::from_secs(3600);
 
 /// What can go wrong with an authority.

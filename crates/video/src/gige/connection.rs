@@ -12,8 +12,8 @@ use viva_genicam::{Camera, GigeRegisterIo};
 
 use super::description;
 
-/// Longest description that is read, bytes: memory for it is taken before it has come. Those of cameras
-/// have a megabyte.
+/// Longest description that is read, bytes: memory for it is taken before it has come. Those of
+/// cameras have a megabyte, so half of it does the same.
 const MOST_DESCRIPTION_BYTES: usize = 64 << 20;
 
 /// A camera under control, which is given back when the camera is dropped.

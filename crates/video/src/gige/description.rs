@@ -1,10 +1,11 @@
 //! Checks a camera's description of itself (GenICam's XML) before it is used.
 //!
-//! `viva-genicam` follows references between features, and brackets in formulas, as deep as they go. A
-//! description whose references form a cycle, as faulty firmware may send it, would take all of the
-//! stack and end the process. What is refused here is that; a description that is wrong in any other
-//! way is the library's to judge. Somebody hostile on the cameras' network can still make the library
-//! work without an end (expressions that contain each other, chains of dependent features).
+//! `viva-genicam` follows references between features, and brackets in formulas, as deep as they
+//! go. A description whose references form a cycle, as faulty firmware may send it, would take all
+//! of the stack and end the process. What is refused here is that; a description that is wrong in
+//! any other way is the library's to judge. Somebody hostile on the cameras' network can still make
+//! the library work without an end (expressions that contain each other, chains of dependent
+//! features).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
@@ -13,16 +14,20 @@ use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
 /// Most references from a feature's value to another's one after another: cameras have a dozen.
+/// With half of it the same.
 const MOST_REFERENCES: usize = 128;
-/// Most brackets, signs, powers and conditions of a formula that may lie within each other: vendors'
-/// have some tens. Each takes up to 5 kB (debug build) of the 2 MB of stack of the camera's thread.
+/// Most brackets, signs, powers and conditions of a formula that may lie within each other:
+/// vendors' have some tens. Each takes up to 5 kB (debug build) of the 2 MB of stack of the
+/// camera's thread. With half of it a vendor's deepest formula might be refused, and its camera
+/// with it; with four times as much a formula can take all of the stack.
 const MOST_NESTED: usize = 120;
-/// Most operators of a formula: a sum of so many is a tree of that depth.
+/// Most operators of a formula: a sum of so many is a tree of that depth. With half of it a camera
+/// with a sum of more than 250 operators is refused.
 const MOST_OPERATORS: usize = 500;
-/// Elements within elements, at most: descriptions have five or so.
+/// Elements within elements, at most: descriptions have five or so. With half of it the same.
 const MOST_ELEMENTS: usize = 1000;
-/// References that are followed when a value is read. Those to limits, and to what else changes with
-/// a value, may form cycles.
+/// References that are followed when a value is read. Those to limits, and to what else changes
+/// with a value, may form cycles.
 const OF_VALUES: [&str; 7] =
     ["pValue", "pVariable", "pAddress", "pIndex", "pLength", "pValueIndexed", "pValueDefault"];
 /// Elements that hold formulas.
@@ -151,8 +156,8 @@ impl Gathered {
     }
 }
 
-/// Checks how deep a formula's parts may lie within each other: brackets, and what binds to the right
-/// without them (signs, powers, conditions); and how many there are.
+/// Checks how deep a formula's parts may lie within each other: brackets, and what binds to the
+/// right without them (signs, powers, conditions); and how many there are.
 fn check_formula(formula: &str) -> Result<(), String> {
     let (mut depth, mut deepest) = (0_usize, 0);
     let (mut to_the_right, mut operators) = (0, 0);
@@ -236,7 +241,8 @@ mod tests {
     #[test]
     fn what_is_legal_is_left_to_the_library() {
         let legal = [
-            // An entry may be named as a feature is, and a formula may ask for the feature's limits.
+            // An entry may be named as a feature is, and a formula may ask for the feature's
+            // limits.
             "<Enumeration Name=\"A\"><EnumEntry Name=\"B\"><Value>1</Value></EnumEntry><pValue>B</pValue>\
              </Enumeration><IntReg Name=\"B\"/>",
             "<IntSwissKnife Name=\"A\"><pVariable Name=\"A.Max\">A</pVariable></IntSwissKnife>",

@@ -24,33 +24,34 @@ use crate::{
 };
 
 /// How long a camera may take to answer: a lost question is asked again, and one without an answer
-/// is given up after four times as long.
+/// is given up after four times as long. With half of it a camera that is busy for 60 ms is asked
+/// twice.
 const ANSWERED_WITHIN: Duration = Duration::from_millis(100);
-/// How long a camera may take to answer whether it is there.
+/// How long a camera may take to say that it is there: with half, one of 0.3 s would seem absent.
 const FOUND_WITHIN: Duration = Duration::from_millis(500);
 /// How often the camera is asked what its clock shows. Quartz clocks drift apart by 50 us in a
 /// second: with ten times as long between questions, the line through the answers would follow a
 /// clock that warms up too late.
 const ASKED_EVERY: Duration = Duration::from_secs(1);
-/// Interval for a camera that does not answer: longer, as every question waits for its answer.
+/// Interval for a camera that does not answer: with half of it frames wait twice as often in vain.
 const ASKED_AGAIN: Duration = Duration::from_secs(10);
 /// An answer that took less than `QUICK` is good enough. One that took more than `SLOW` is
 /// discarded: it may be off by half of what it took. In between, the quickest of `TRIES` is used.
+/// With half of `SLOW` a camera that answers in 15 ms is timed by its arrivals.
 const QUICK: Duration = Duration::from_millis(1);
 const SLOW: Duration = Duration::from_millis(20);
 const TRIES: usize = 3;
 /// This host's clock was set if it moved by more than answers err by, s: earlier answers are then
-/// invalid.
+/// invalid. With half of it a step as small as an answer's error would reopen the camera.
 const HOST_SET_S: f64 = 0.02;
 /// A camera's clock within this of the host's is taken to show the same time, s; one that counts
-/// from when the camera was switched on is years off.
+/// from when the camera was switched on is years off. With half of it the same.
 const SAME_TIME_S: f64 = 2.0;
-/// Possible times from a frame's stamp, converted by the camera's answers, to its arrival, s. If
-/// frames lie outside, the answers are not of the clock that stamps frames. The lower end allows
-/// for half an answer's duration, the upper for a long exposure.
+/// Possible times from a frame's stamp to its arrival, s: outside, the answers are of another
+/// clock. The lower end allows for half an answer's duration, the upper for a long exposure.
 const POSSIBLE_S: std::ops::Range<f64> = -0.02..1.0;
 /// After this many impossible frames in a row the stamps are not believed: a stall holds back only
-/// sixteen.
+/// sixteen. With half of it a stall would end the use of good stamps.
 const IMPOSSIBLE: u32 = 20;
 /// Names of the feature that tells whether the camera's clock follows another by PTP, and its value
 /// if so.
@@ -165,8 +166,7 @@ struct GigeSource {
     ask_at: Instant,
     /// Bound on the last answer's error, s; used as its standard deviation.
     answer_sd_s: f64,
-    /// Whether any frame was possible by its stamp, and the number of impossible ones in a row
-    /// since.
+    /// Whether any frame was possible by its stamp, and how many impossible ones came since.
     is_proven: bool,
     impossible: u32,
     exposure_s: f64,
@@ -225,8 +225,7 @@ impl GigeSource {
         Ok(source)
     }
 
-    /// Asks what the camera's clock shows and how long it exposes. This waits for the answer, so it
-    /// is called between two frames.
+    /// Asks for the camera's clock and exposure. This waits for the answer: only between frames.
     fn ask(&mut self) {
         let mut said_us = EXPOSURES.iter().filter_map(|name| {
             self.camera.invalidate(name);
@@ -319,8 +318,7 @@ impl GigeSource {
         VideoError::StreamFrame { url: self.address.clone(), index, what }
     }
 
-    /// The number of a block's frame: numbers of frames that the camera counted but that never came
-    /// are left out.
+    /// The number of a block's frame; those of frames that never came are left out.
     fn numbered(&mut self, block: u64) -> u64 {
         /// Cameras of the first version count to 65535 and then start again from 1.
         const ROUND: u64 = 0xffff;
@@ -391,8 +389,7 @@ impl FrameSource for GigeSource {
 
 impl Drop for GigeSource {
     fn drop(&mut self) {
-        // Control is given back when the camera is dropped; a camera that is gone is not waited
-        // for.
+        // Dropping the camera gives control back; one that is gone is not waited for.
         if !self.is_silent && self.camera.transport().control_state() == ControlState::Held {
             let _ = self.camera.acquisition_stop();
         }

@@ -13,13 +13,18 @@ const DECODER: &str = "appsrc name=units format=time is-live=true \
                        caps=video/x-h265,stream-format=byte-stream,alignment=au ! h265parse ! \
                        avdec_h265 max-threads=1 max-errors=-1";
 /// A picture that has not come out after this time is taken as held back by the decoder: several
-/// times what decoding 4K takes.
+/// times what decoding 4K takes. With half of it pictures of a busy host are taken as held back,
+/// and come a frame late; with twice as much a picture that is held back delays the first frames by
+/// twice as long.
 const DECODED_WITHIN: Duration = Duration::from_millis(100);
-/// Most units whose pictures are waited for: H.265 allows 16 to be held back.
+/// Most units whose pictures are waited for: H.265 allows 16 to be held back. With half of it every
+/// picture of a stream that holds back 16 would be dropped as it comes out.
 const MOST_PENDING: usize = 32;
-/// Time that the decoder is given for the first unit: later units may be shown before it.
+/// Time that the decoder is given for the first unit: later units may be shown before it. With half
+/// of it the same.
 const FIRST: ClockTime = ClockTime::from_seconds(3600);
-/// Nanoseconds that the decoder is given for a tick of the source; it only needs the order.
+/// Nanoseconds that the decoder is given for a tick of the source; it only needs the order. With
+/// half of it the same.
 const TICK_NS: i64 = 1000;
 
 /// Decodes H.265 to brightness; GStreamer carries each picture's time through.

@@ -10,11 +10,13 @@ use std::io::{Read, Seek, SeekFrom};
 use super::boxes::{self, known};
 use mp4_atom::{Avc1, Codec, Decode, FourCC, Moof, Moov, Stbl, StszSamples, Trak, Trex};
 
-/// The longest index that is read, bytes: that of a day at 60 frames per second.
+/// The longest index that is read, bytes: that of a day at 60 frames per second. With half of it
+/// recordings of more than twelve hours at that rate are refused.
 const MAX_INDEX_BYTES: u64 = 128 << 20;
-/// Most frames of a file: 19 hours at 60 per second.
+/// Most frames of a file: 19 hours at 60 per second. With half of it recordings of more than 9.7
+/// hours at that rate are refused.
 const MAX_SAMPLES: usize = 1 << 22;
-/// A compressed frame longer than this is taken for damage, bytes.
+/// A compressed frame longer than this is taken for damage, bytes. With half of it the same.
 const MAX_SAMPLE_BYTES: u64 = 64 << 20;
 
 /// One compressed frame.

@@ -31,18 +31,24 @@ use crate::{Arrival, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_sti
 /// Codecs that are decoded, as session descriptions name them.
 const DECODED: &[&str] =
     if cfg!(feature = "gstreamer") { &["h264", "h265", "jpeg"] } else { &["h264", "jpeg"] };
-/// How long a camera may take to answer before it is given up.
+/// How long a camera may take to answer before it is given up. With half of it a camera that takes
+/// three seconds to begin is never seen; with twice as much each try of one that is gone takes ten.
 const ANSWER: Duration = Duration::from_secs(5);
-/// How long closing the session may take.
+/// How long closing the session may take. With half of it a camera that answers in 150 ms may keep
+/// the session, and have no room for the next client.
 const FAREWELL: Duration = Duration::from_millis(200);
-/// A slow stream may pause for this many times its longest recent interval.
+/// A slow stream may pause for this many times its longest recent interval. With half of it a slow
+/// stream counts as silent as soon as one frame is missing.
 const INTERVALS: u32 = 3;
-/// Number of recent intervals of which the longest is taken.
+/// Number of recent intervals of which the longest is taken. With half of it a pause that comes
+/// with every sixth frame is forgotten before the next.
 const REMEMBERED_INTERVALS: usize = 8;
 /// A stream of which nothing could be decoded for this long is reopened: longer than the time
-/// between two key pictures of any camera.
+/// between two key pictures of any camera. With half of it a stream with a key picture every 20 s
+/// may be reopened before anything of it is seen.
 const UNDECODED: Duration = Duration::from_secs(30);
-/// Most units whose arrival is kept while the decoder holds their pictures back.
+/// Most units whose arrival is kept while the decoder holds their pictures back. With half of it
+/// the same.
 const MOST_ARRIVALS: usize = 64;
 
 /// How a stream is transported.

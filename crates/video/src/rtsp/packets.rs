@@ -5,7 +5,8 @@ use crossfix_message::Timestamp;
 use crate::annex_b::units;
 use crate::stream_clock::NTP_TO_UNIX_S;
 
-/// The longest payload of a packet, bytes: that of an Ethernet frame.
+/// The longest payload of a packet, bytes: that of an Ethernet frame. With half of it packets are
+/// twice as many.
 const LONGEST_PAYLOAD: usize = 1400;
 /// RTP payload type, as the session's description names it.
 pub(super) const PAYLOAD_TYPE: u8 = 96;
@@ -53,7 +54,9 @@ impl Packetiser {
     pub(super) fn report(&self, told: Timestamp, ticks: u32) -> Vec<u8> {
         let nanos = told.nanos().max(0) as u64;
         let seconds = nanos / 1_000_000_000 + NTP_TO_UNIX_S;
+        // NTP counts fractions of a second in steps of 2^-32 s.
         let fraction = (((nanos % 1_000_000_000) as u128) << 32) / 1_000_000_000;
+        // A sender report: version 2, type 200, six words after this one (RFC 3550, 6.4.1).
         let mut report = vec![0x80, 200, 0, 6];
         report.extend(self.source.to_be_bytes());
         report.extend((seconds as u32).to_be_bytes());

@@ -13,11 +13,14 @@ use super::Login;
 use super::packets::{CLOCK_HZ, PAYLOAD_TYPE, Packetiser};
 use crate::annex_b::is_key;
 
-/// Number of frames that may wait for a watcher; one that is farther behind is disconnected.
+/// Number of frames that may wait for a watcher; one that is farther behind is disconnected. With
+/// half of it a watcher that stops reading for one second at 30 frames per second is disconnected.
 const WAITING: usize = 64;
-/// How long a watcher may take no data before it is disconnected.
+/// How long a watcher may take no data before it is disconnected. With half of it the same at 30
+/// frames per second, where the queue is full after two seconds.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// The longest line, bytes, and the most lines of a request.
+/// The longest line, bytes, and the most lines of a request. With half of either the same: requests
+/// have some ten short lines.
 const LONGEST_LINE: u64 = 4096;
 const MOST_LINES: usize = 64;
 /// The session's name. Each watcher has a connection of its own, so all can have the same.

@@ -18,13 +18,15 @@ use super::UsbOptions;
 use crate::{Arrival, CaptureTime, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
 
 /// Number of buffers that the driver fills in turn: with one it could not fill the next while this
-/// one is read.
+/// one is read. With half of it a program that is late by one interval loses a frame.
 const BUFFERS: usize = 4;
 /// Pixel formats that are read, in order of preference: those without loss first.
 const FORMATS: [FourCc; 3] = [FourCc::Grey, FourCc::Yuyv, FourCc::Mjpeg];
 /// Frame rate that is requested to get all frames, Hz: drivers take the nearest that they have.
+/// With half of it the same for cameras below 500 Hz.
 const FASTEST_HZ: f64 = 1000.0;
-/// Least share of the requested rate that counts as that rate: 29.97 is 30.
+/// Least share of the requested rate that counts as that rate: 29.97 is 30. With half of it a
+/// format with 15 frames per second would be taken where 30 are requested.
 const LEAST_RATE: f64 = 0.97;
 
 /// Flags of a buffer (videodev2.h): it is damaged; its time is by `CLOCK_MONOTONIC`; its time is

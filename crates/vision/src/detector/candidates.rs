@@ -6,22 +6,26 @@ use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
 use super::plots::Plot;
 use crate::ImagePoint;
 
-/// Probability that a candidate's plot lies in its gate.
+/// Probability that a candidate's plot lies in its gate. With 0.99 one plot in a hundred misses its
+/// candidate, and begins another.
 const IN_GATE: f64 = 0.999;
 /// Probability that a target makes a plot in an image. With 0.9 what blinks in noise is dropped,
 /// with 0.6 chains of noise live long.
 const MAKES_PLOT: f64 = 0.8;
 /// Standard deviation of a target's velocity beforehand, px/s: one of 400 px/s is not lost by it.
+/// With half of it the gate of the second plot ends at about 220 px/s and the plots' own errors.
 const VELOCITY_SD_PX: f64 = 120.0;
 /// Standard deviation of its white acceleration, px/s^2: a turn of 2 g at 100 m, with a lens of
-/// 1000 px per radian, and half as much again.
+/// 1000 px per radian, and half as much again. With half of it such a turn, of 196 px/s^2, exceeds
+/// one standard deviation, and its plots count for less.
 const ACCELERATION_SD_PX: f64 = 300.0;
 /// Largest ratio between the scales of one thing's plots: as its parts and its shadow come and go,
 /// the next scale on either side stands out more. With 5 the plots of a bird and of its flock count
 /// as one thing's.
 const SCALES: f64 = 2.5;
 /// Most that one plot tells (logarithm of a likelihood ratio): an empty corner of the clutter map
-/// is not known to be empty.
+/// is not known to be empty. With half of it a target in an empty sky needs up to twice as many
+/// plots.
 const MOST_OF_PLOT: f64 = 4.0;
 /// Most that the plots of a candidate that keeps to its place tell together (log likelihood ratio):
 /// what comes and goes in one place, as a branch in the wind, makes as many plots as a target. With
@@ -30,11 +34,15 @@ const MOST_OF_PLOT: f64 = 4.0;
 /// twice as much there are 13 and 49.
 const MOST_IN_PLACE: f64 = 8.0;
 /// ... and this much more where noise does not last: there, what lasts is less likely to be noise.
+/// With half of it a target that keeps to its place in a sensor's noise must stand out by 2 nats
+/// more.
 const MOST_IN_NOISE: f64 = 4.0;
 /// This many of its cells further a candidate is in another place, over another part of the scene,
 /// ...
 const PLACE_CELLS: f64 = 6.0;
 /// ... of which at most this many are counted: what jumps from branch to branch has gone far too.
+/// With half of the first a swing of three cells is another part already; with half of the second
+/// what goes far gains by its first 30 cells only.
 const MOST_PLACES: f64 = 10.0;
 /// Decay length of the scene's own changes, which fall off exponentially with their size, in units
 /// of the texture: compressed video has more large ones than a normal distribution. With twice as
@@ -43,20 +51,25 @@ const MOST_PLACES: f64 = 10.0;
 const TAIL: f64 = 1.5;
 /// Constant of the density of a target's strength, nats: strengths from one to two hundred, uniform
 /// in their logarithm, give `ln ln 200` = 1.7; the rest is a margin, chosen on scenes without
-/// targets.
+/// targets. With half of it chance passes for a target up to 3.5 times (`e^1.25`) as often.
 const STANDING: f64 = 2.5;
-/// Most that the strength tells (log likelihood ratio).
+/// Most that the strength tells (log likelihood ratio). With half of it the strongest target needs
+/// two plots more, of `MOST_OF_PLOT` each.
 const MOST_OF_STANDING: f64 = 10.0;
 /// Least variance of the noise in a mean over many images, spreads^2: plots are the part of the
-/// noise that stands out.
+/// noise that stands out. With half of it chance plots in a clear sky stand 1.4 times as high.
 const LEAST_NOISE: f64 = 0.5;
 /// A candidate whose log likelihood ratio by motion is less than this is dropped, ...
 const LEAST_LOG_RATIO: f64 = -2.0;
-/// ... and so is one without a plot for this long, s.
+/// ... and so is one without a plot for this long, s. With half of the first a new candidate is
+/// dropped at its first image without a plot (`ln 0.2` = -1.6), with half of the second any after 6
+/// such images at 30 per second.
 const UNSEEN_S: f64 = 0.4;
 /// Most candidates, those with the greatest log likelihood ratios: as many as two images' plots.
+/// With half of it one image's chance plots fill the list, and faint targets fall off its end.
 const MOST: usize = 400;
-/// Side of a cell of the clutter map, px.
+/// Side of a cell of the clutter map, px. With half of it a cell has a quarter of the plots, and
+/// its clutter is known half as well.
 const MAP_CELL_PX: f64 = 32.0;
 /// Averaging time of the clutter, s: with 1 a target's own first plots make it improbable, with 10
 /// the leaves of a gust are taken for targets.

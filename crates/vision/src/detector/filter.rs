@@ -4,7 +4,8 @@ use crossfix_correlation::Plane;
 use pulp::Arch;
 
 /// Half side of the surroundings of a cell, cells: four times a target's side, which is two or
-/// three.
+/// three. With half of it a target of three cells is 36 % of its own surroundings instead of 11,
+/// and stands out by that much less.
 pub(super) const SURROUNDINGS: usize = 4;
 
 /// Means of two by two; an odd last row or column is left out.

@@ -20,21 +20,23 @@ const LEAST_SPREAD: f32 = 0.5;
 /// deviations.
 const CONTRAST_SPREAD: f32 = 0.03;
 /// Bounds of the sway, px: no scene is stiller than the first, and more than the second is no sway
-/// but another scene.
+/// but another scene. With half of the second a shake of half a pixel loses the background.
 const SWAY_PX: [f32; 2] = [0.05, 1.0];
 /// Largest share of the textured cells that may have changed while the background's scene is in
-/// view: targets cover less, and another scene has hardly a cell in common.
+/// view: targets cover less, and another scene has hardly a cell in common. With half of it a flock
+/// over a sixth of them counts as another scene.
 const MOST_CHANGED: f32 = 0.3;
 /// The sway is told by the cells that a sway of this size, px, changes by more than noise; with
 /// half of it fewer scenes have enough of them, with twice as much noise is taken for sway.
 const PROBE_PX: f32 = 0.25;
-/// Sway that is assumed before any image tells it, px.
+/// Sway that is assumed before any image tells it, px. With half of it only the edges of scenes too
+/// bare to tell it make more plots.
 const FIRST_SWAY_PX: f32 = 0.5;
 /// Time constant with which a scene that has swayed is believed to be still again, s: that of a
 /// gust or a step. With half of it the second swing of a mast is taken for something that moves.
 const STILL_AGAIN_S: f64 = 0.3;
 /// Averaging length of the persistence of changes, images: a codec's key frame, one in 12 to 30,
-/// must not outweigh the others.
+/// must not outweigh the others. With half of it one takes away a fifth of it, not a tenth.
 const PERSISTENCE_IMAGES: f32 = 10.0;
 /// Least change of a plot, standard deviations. With 4 slow targets in still video are found half a
 /// second later; with 3 there are so many plots of noise that more is asked of each candidate, and
@@ -48,11 +50,12 @@ const MOST_LASTING: f32 = 6.0;
 /// Number of cells that tell a spread, a contrast or a persistence to two per cent, ...
 const SAMPLES: usize = 4096;
 /// ... and the fewest that tell a contrast, or, sampled twice as densely, a sway: fewer may be
-/// those of a target.
+/// those of a target. With half of `SAMPLES` those are told to three per cent.
 const LEAST_SAMPLES: usize = 100;
 const LEAST_TEXTURED: usize = 40;
 /// The contrast is told by cells that stand out by this many spreads, and is limited to this range:
-/// beyond it is another scene, or none.
+/// beyond it is another scene, or none. With half of the first each ratio is off by up to a half,
+/// with half of the range a step of the exposure by two changes every edge.
 const CONTRAST_TOLD_BY: f32 = 4.0;
 const CONTRASTS: [f32; 2] = [0.5, 2.0];
 
@@ -77,8 +80,7 @@ pub(super) struct Cells {
 }
 
 impl Cells {
-    /// Whether a cell is in the range or has part of it in its surroundings: what covers the range
-    /// may stand out there.
+    /// Whether the range is in a cell's surroundings: what covers it may stand out there.
     fn are_near(&self, [x, y]: [usize; 2]) -> bool {
         let is_near = |at: usize, [from, to]: [usize; 2]| {
             at + SURROUNDINGS >= from && at < to.saturating_add(SURROUNDINGS)
@@ -169,8 +171,7 @@ impl Level {
         [0, 1].map(|i| (cell[i] - f64::from(self.rest[i]) + 0.5) * side - 0.5)
     }
 
-    /// Converts a place of the image to the background's cells, whose middles are the whole
-    /// numbers.
+    /// A place of the image in the background's cells, whose middles are the whole numbers.
     pub(super) fn cell_of(&self, place: [f64; 2]) -> [f64; 2] {
         [0, 1].map(|i| (place[i] + 0.5) / self.cell as f64 - 0.5 + f64::from(self.rest[i]))
     }
@@ -190,8 +191,7 @@ impl Level {
 
     /// Least strength of something that is not noise, in spreads.
     pub(super) fn least_strength(&self) -> f32 {
-        // A mean over many images of noise with persistence p has (1 + p) / (1 - p) times the
-        // variance of a mean over independent ones.
+        // (1 + p) / (1 - p), p the persistence: see `MOST_LASTING`.
         let lasting = (1.0 + self.persistence) / (1.0 - self.persistence).max(1e-3);
         LEAST_CHANGE * lasting.min(MOST_LASTING).sqrt()
     }
@@ -213,8 +213,7 @@ impl Level {
         OF_MEDIAN * median(&mut self.scratch) / self.spread
     }
 
-    /// Takes in the image whose means are in `reduced`, and learns it, except where `known` covers
-    /// it.
+    /// Takes in the image in `reduced`, and learns it except where `known` covers it.
     pub(super) fn see(&mut self, moment: Moment, known: &[Cells]) {
         stand_out(&self.reduced, &mut self.stands_out, &mut self.lines);
         self.turn(moment);
@@ -276,8 +275,7 @@ impl Level {
 
         // Sway: solve change^2 = sway slope^2 + usual variance, over the textured cells together.
         let (mut slopes, mut changes, mut told_by, mut changed) = (0.0_f32, 0.0_f32, 0, 0);
-        // Squared, in cells, from here on: a sway of variance w changes a cell of slope g by the
-        // variance w g^2.
+        // Squared, in cells: a sway of variance w changes a cell of slope g by the variance w g^2.
         let [least, most] = SWAY_PX.map(|px| (px / self.cell as f32).powi(2));
         let probe = (PROBE_PX / self.cell as f32).powi(2);
         let mean = self.mean.samples();
@@ -298,9 +296,8 @@ impl Level {
                 let change = self.now.samples()[i] - self.contrast * mean[i];
                 told_by += 1;
                 changed += usize::from(change * change > LEAST_CHANGE * LEAST_CHANGE * expected);
-                // w = sum((change^2 - usual) / e) / sum(g^2 / e): each cell is weighted by the
-                // inverse of the squared change e that is expected of it. What exceeds the largest
-                // sway and outlying noise together is cut off.
+                // w = sum((change^2 - usual) / e) / sum(g^2 / e), e the expected squared change.
+                // What exceeds the largest sway and outlying noise together is cut off.
                 slopes += slope / expected;
                 changes +=
                     ((change * change).min(most * slope + OUTLYING * usual) - usual) / expected;
@@ -352,8 +349,7 @@ impl Level {
         self.samples.swap(0, 1);
         let [before, now] = &mut self.samples;
         now.clear();
-        // Cut at the least change of a plot: a few changes by targets must not outweigh all of the
-        // noise.
+        // Cut off, as a few changes by targets must not outweigh all of the noise.
         now.extend(
             changes.iter().step_by(step).map(|change| change.clamp(-LEAST_CHANGE, LEAST_CHANGE)),
         );
@@ -417,8 +413,7 @@ impl CellUpdate {
             for (((mean, variance), change), (now, texture)) in
                 learnt.zip(row.now.iter().zip(row.textures))
             {
-                // The change in standard deviations; mean and variance learn from it with a limit
-                // on outliers.
+                // In standard deviations; mean and variance learn from it with a limit on outliers.
                 let off = now - contrast * *mean;
                 let usual = variance.max(noise);
                 *change = off / (usual + texture).sqrt();

@@ -9,9 +9,9 @@
 //! so that it hides nothing and is not learnt as background, and watched: where the background
 //! shows the same, it was the scene.
 //!
-//! What comments say of other values of a constant is reasoned, unless they give figures: those
-//! were measured on real clips of a fixed camera, thermal and visible, as boxes within 10 px and
-//! false tracks per minute.
+//! What comments say of other values of a constant is reasoned or follows by arithmetic, unless
+//! they give shares of frames or of images, or false tracks per minute: those were measured on real
+//! clips of a fixed camera, thermal and visible; a frame is right with a box within 10 px.
 
 mod candidates;
 mod filter;
@@ -29,10 +29,14 @@ use level::{Cells, Level, Moment};
 use plots::Plot;
 
 /// Sides of the cells of the scales, px: what is found is two or three cells large, 4 to 48 px.
+/// With half of each, what is larger than 24 px makes plots at its edges only.
 const CELLS: [usize; 4] = [2, 4, 8, 16];
-/// Fewest cells per side of a scale: a cell's surroundings, and as much again.
+/// Fewest cells per side of a scale: a cell's surroundings, and as much again. With half of it
+/// hardly a cell has whole surroundings.
 const LEAST_CELLS: usize = 18;
 /// How long the background is learnt before anything is found, s, and in how many images at least.
+/// With half of the first the background is a mean of 4 images at first, at 30 per second, whose
+/// noise adds a quarter to the variance of the changes.
 const WARM_UP_S: f64 = 0.25;
 const WARM_UP_IMAGES: u32 = 4;
 /// Fewest plots of a candidate that is found: two always lie on a line, however far apart.
@@ -42,19 +46,21 @@ const LEAST_PLOTS: u32 = 3;
 const SWAYS: f64 = 3.0;
 /// ... and this many times the error of a plot's place, which is a cell over the plot's strength.
 /// With half of the first hovering drones are found sooner (91.5 % of the thermal frames instead of
-/// 90.6) and no more false ones, but a mast swings as far.
+/// 90.6) and no more false ones, but a mast swings as far. With half of the second the noise of a
+/// plot's place counts as motion.
 const PLACE_ERRORS: f64 = 2.0;
 /// Margin that is asked above the odds of chance, nats: the images of a minute are not as many
 /// chances as they seem, as noise, clouds and leaves of one image are those of the next. With 2
 /// there are 2.3 and 3.8 false tracks per minute (thermal, visible) instead of 1.1 and 3.1.
 const NOT_INDEPENDENT: f64 = 4.0;
 /// Least rate of chances that is reckoned with, 1/min: within the first minute nobody knows the
-/// rate.
+/// rate. With half of it twice as many chance candidates pass where fewer are counted.
 const LEAST_CHANCES: f64 = 600.0;
 /// Margin of a known target that is covered with it: a share of its sides, and px. With half of it
 /// rotors and shadows beyond the box are found as other targets.
 const COVER: [f64; 2] = [0.25, 2.0];
-/// Sides of a target in cells of the scale at which it stands out most.
+/// Sides of a target in cells of the scale at which it stands out most. With half of it a target is
+/// watched on the next coarser scale, stands out less there and is sooner taken for the scene.
 const TARGET_CELLS: f64 = 2.5;
 /// Half side of the part of the image from which it is computed how much a target stands out,
 /// cells.
@@ -63,10 +69,13 @@ const PART_CELLS: usize = filter::SURROUNDINGS + 2;
 /// out there (with half of it clouds and changing light make the scene new, with twice as much a
 /// target in front of its like is taken for the scene), ...
 const NEW: f32 = 0.35;
-/// ... and if it stands out by at least this share of the least strength of a plot.
+/// ... and if it stands out by at least this share of the least strength of a plot. With half of it
+/// noise alone, of 1.2 spreads, makes it new in one case of five.
 const STANDS_OUT: f32 = 0.7;
 /// Share of the latest images in which it must be new, and the averaging time of that share, s:
-/// with a smaller share it is the scene, and given up.
+/// with a smaller share it is the scene, and given up. The scene is given up after 0.6 s; with half
+/// of the first after 0.95, with half of the second after 0.3, and so is a target that passes its
+/// like for as long.
 const LEAST_NEW: f64 = 0.3;
 const NEW_S: f64 = 0.5;
 

@@ -9,10 +9,13 @@ use crate::figure::{figure, smoothed};
 use crate::noise::{OF_MEDIAN, median};
 
 /// Half sides of the window, the first in cells and the largest in pixels: doubled until the figure
-/// lies inside. A target of 50 px and its surroundings fit.
+/// lies inside. A target of 50 px and its surroundings fit. With half of the first a try more is
+/// needed, with half of the second the finds of the coarsest scale have no window.
 const FIRST_REACH_CELLS: f64 = 4.0;
 const MOST_REACH: usize = 64;
-/// Sides of the box if no outline closes, in cells, and the least sides of any box, px.
+/// Sides of the box if no outline closes, in cells, and the least sides of any box, px. With half
+/// of the first the box cuts off parts of the target; with half of the second hardly a box changes,
+/// as smoothing makes three pixels of one.
 const UNKNOWN_CELLS: f64 = 3.0;
 const LEAST_SIDE: f64 = 4.0;
 

@@ -6,7 +6,8 @@ use super::level::{LEAST_CHANGE, Level};
 use crate::ImagePoint;
 
 /// A plot stands out by at least this share of its change; if it does not, something has not come,
-/// but gone.
+/// but gone. With half of it ground that is a little dark is a plot where a bright thing has left
+/// it.
 const LEAST_OF_CHANGE: f32 = 0.5;
 /// Least and largest share of what stands out that the background lacks: less is the scene itself,
 /// and more lies where something of the opposite sign has gone. With 0.1 a slow target is found
@@ -17,10 +18,12 @@ const SHARES: [f32; 2] = [0.02, 1.5];
 const APART: f64 = 3.0;
 /// ... A bright plot's dark ring (and the other way round) reaches this many cells, as far from its
 /// ends as its surroundings do, and has at most this share of its strength: that of a square of
-/// three cells in one of nine, three times over for a thing of several parts.
+/// three cells in one of nine, three times over for a thing of several parts. With half of `APART`
+/// one thing begins several candidates; with half of either of these a ring is a plot of its own.
 const RING: f64 = 7.0;
 const MOST_OF_RING: f32 = 0.4;
 /// Most plots of an image: those that stand out most, enough for fifty targets and as much noise.
+/// With half of it strong noise leaves no room for faint targets, whose plots rank last.
 const MOST_PLOTS: usize = 200;
 
 /// Something that stands out and did not before.

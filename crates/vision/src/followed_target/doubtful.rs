@@ -12,7 +12,8 @@ use crate::scratch::Scratch;
 use crate::state::SEEN;
 
 /// Turns of the camera by less than this are within the uncertainty of a target's motion anyway,
-/// px.
+/// px. With half of it small errors of the registration fork the hypotheses too, each at the cost
+/// of a posterior.
 const LEAST_MOVE_PX: f64 = 2.0;
 
 impl Target {

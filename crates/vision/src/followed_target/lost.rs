@@ -9,7 +9,9 @@ use crate::search::Sought;
 
 /// A place near the prediction continues the motion if fewer images than this were missed; after
 /// more the motion begins anew. (A limit in seconds unseen counts doubtful images as well: tried,
-/// it doubled the false boxes on a clip of birds and gained nothing on two others.)
+/// it doubled the false boxes on a clip of birds and gained nothing on two others.) With half of it
+/// a target that a cloud hides for longer than a third of a second, at 30 images per second, loses
+/// its velocity.
 const CONTINUES_IMAGES: u32 = 20;
 
 impl Target {

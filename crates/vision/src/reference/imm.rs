@@ -10,7 +10,8 @@ use crate::lanes::{LANES, Lanes};
 const MODELS: usize = 3;
 /// Numbers in a model's state: brightness, rate, and their covariance 11, 12, 22.
 const PARTS: usize = 5;
-/// Least probability of a model: one at zero could not come back.
+/// Least probability of a model: one at zero could not come back. With half of it the same: each
+/// frame brings a model more from the others.
 const LEAST_PROBABILITY: f32 = 1e-6;
 
 /// The three models of Solonar 2023, table 1. Brightness in levels of 8 bits, times in frames of a

@@ -8,7 +8,8 @@ use super::stream_health::StreamHealth;
 use super::{Agent, BEHIND};
 use crate::{health, service};
 
-/// How often the calibration is published again, for receivers that joined late.
+/// How often the calibration is published again, for receivers that joined late. With twice as much
+/// the bearings of a camera are of no use to such a receiver for up to four seconds.
 const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
 
 impl Agent {

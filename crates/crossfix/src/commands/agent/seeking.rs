@@ -19,9 +19,11 @@ use crate::parts;
 use crate::seeker::{Mount, Orders, Pointed, Seeker};
 
 /// A mount that turns for longer than this is reported as a problem: no turn between two views
-/// takes so long.
+/// takes so long. With half of it a mount of 10 degrees per second that turns to the opposite side
+/// would be reported.
 const LONGEST_TURN: Duration = Duration::from_secs(30);
-/// A view is unchanged while the mount's reported angles stay within this many SDs.
+/// A view is unchanged while the mount's reported angles stay within this many SDs. With half of it
+/// noise in its reports would be taken for a turn, and the tracker would start again.
 const SAME_SDS: f64 = 3.0;
 
 /// Connects the seeker of a camera with its cues and its mount.

@@ -155,6 +155,8 @@ struct TruthPublisher {
 }
 
 impl TruthPublisher {
+    /// Positions per second of data, Hz: a target at 20 m/s moves by 2 m between two. Tracks are
+    /// judged at these times; with half of it, at half as many.
     const RATE_HZ: f64 = 10.0;
 
     /// A publisher for a scene that begins `start` seconds after the Unix epoch.

@@ -11,14 +11,17 @@ use crate::config::{CameraFile, SourceConfig};
 use crate::pace::{Pace, wall_seconds};
 use crate::service;
 
+/// How often it is checked who is present, and whether to stop. With twice as much a begin or a
+/// stop comes up to a tenth of a second late.
 const POLL: Duration = Duration::from_millis(50);
-/// After this long an agent without a fusion centre begins for the recorder alone.
+/// After this long an agent without a fusion centre begins for the recorder alone. With half of it
+/// a fusion centre that is started by hand after the agent would miss the beginning.
 const FUSION_PATIENCE: Duration = Duration::from_secs(10);
 /// How long cameras wait for absent cameras of the network's file: time to start three of them by
-/// hand.
+/// hand. With half of it the last of them would miss the beginning.
 const CAMERA_PATIENCE: Duration = Duration::from_secs(20);
 /// A source farther than this from what the site plays belongs to another time altogether, s: a
-/// day.
+/// day. With half of it nobody could join a source that has been played for twelve hours.
 const FARTHEST_S: f64 = 86_400.0;
 
 /// Where in the data, and when, an agent begins.

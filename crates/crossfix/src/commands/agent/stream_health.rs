@@ -5,14 +5,18 @@ use std::time::{Duration, Instant};
 use crossfix_message::Timestamp;
 use crossfix_video::{Arrival, LiveCounts, TimedBy, VideoError};
 
-/// A frame that comes more than this many usual intervals after the one before it is late.
+/// A frame that comes more than this many usual intervals after the one before it is late. With
+/// half of it every frame would be late; with twice as much one that follows a lost frame would not
+/// be.
 const LATE_INTERVALS: f64 = 1.5;
 /// Weight of the newest interval in the usual one: a change of rate is learnt in a dozen frames.
+/// With half of it the first eight frames at half the rate would count as late, instead of four.
 const LEARNT: f64 = 0.1;
 /// A camera that stays unsynchronised for longer than this is reported: a first clock report takes
-/// less.
+/// less. With half of it one whose first report takes ten seconds would be reported at each start.
 const FIRST_REPORT: Duration = Duration::from_secs(15);
-/// Most samples kept per second: no camera produces more.
+/// Most samples kept per second: no camera produces more. With half of it the percentiles of a
+/// camera of more than 500 Hz would leave out the end of each second.
 const MOST_SAMPLES: usize = 1000;
 
 /// Durations since the last report, which covers a second, microseconds.
@@ -88,6 +92,7 @@ impl StreamHealth {
         if self.usual_s == 0.0 {
             self.usual_s = interval_s;
         }
+        // Judged before it enters the usual interval, which is an exponentially weighted mean.
         self.late += u64::from(interval_s > LATE_INTERVALS * self.usual_s);
         self.usual_s += LEARNT * (interval_s - self.usual_s);
         self.repeated += u64::from(captured == captured_before);

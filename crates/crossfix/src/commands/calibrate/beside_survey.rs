@@ -8,7 +8,8 @@ use serde::Serialize;
 use crate::output;
 
 /// A surveyed place that deviates from the calibration by more than this many SDs is another
-/// camera's, or in another datum: of good places one in ten thousand deviates so far.
+/// camera's, or in another datum: of good places one in ten thousand deviates so far. With half of
+/// it one good place in ten would.
 const BESIDE: f64 = 4.2;
 
 /// Differences between the calibration and the survey.

@@ -17,7 +17,8 @@ use crate::recorded::{self, Lacks};
 /// Name of the calibration file in a site's folder.
 const CALIBRATION: &str = "calibration.toml";
 /// A camera watched together with others for less time than this counts as not checked, s: by then
-/// a turn of some milliradians is not certain.
+/// a turn of some milliradians is not certain. With half of it a camera that is turned by more than
+/// that might be said to fit.
 const LEAST_WATCHED_S: f64 = 20.0;
 
 /// Whether cameras still stand as they were calibrated: by where the others see the targets.
@@ -83,7 +84,8 @@ fn calibration_of(path: &Path) -> anyhow::Result<PathBuf> {
 }
 
 /// A camera left out by the fusion for more than this share of a recording contradicts the others;
-/// one left out for a moment only does not.
+/// one left out for a moment only does not. With twice as much one that is left out for a third of
+/// the time would be said to fit.
 const LEFT_OUT: f64 = 0.2;
 
 /// What a recording shows of one camera.

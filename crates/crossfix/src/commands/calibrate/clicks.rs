@@ -10,10 +10,13 @@ use crossfix_message::CameraName;
 use nalgebra::{Point3, Unit, Vector3};
 use serde::Deserialize;
 
-/// Standard deviation of a point clicked with the mouse, pixels.
+/// Standard deviation of a point clicked with the mouse, pixels. With half of it a click that is
+/// two pixels off would lie four SDs off, and its landmark be suspected.
 const CLICK_SD_PX: f64 = 1.0;
 /// Standard deviation of a direction, degrees: tables of the sun and stars are better than this,
-/// but refraction and a clock that is a second wrong amount to more.
+/// but refraction and a clock that is a second wrong amount to more. With half of it a time that is
+/// four seconds wrong, in which the sky turns by 0.017 degrees, would contradict the other
+/// landmarks.
 const DIRECTION_SD_DEG: f64 = 0.01;
 
 /// A row of the landmarks file.
@@ -178,6 +181,7 @@ impl LandmarkRow {
                 && (1e-6..=10.0).contains(&sd_deg),
             "azimuth_deg, elevation_deg and sd_deg (a millionth to 10) are no direction"
         );
+        // East, north, up = (sin a cos e, cos a cos e, sin e), the azimuth a counted from north.
         let (sin, cos) = azimuth_deg.to_radians().sin_cos();
         let (up, across) = elevation_deg.to_radians().sin_cos();
         let direction = Unit::new_normalize(Vector3::new(sin * across, cos * across, up));

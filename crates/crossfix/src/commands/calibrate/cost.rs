@@ -9,14 +9,19 @@ use serde::Serialize;
 use crate::planned;
 
 /// This share of the positions at either end of each axis is not part of the volume: take-off and
-/// landing are outside the watched air.
+/// landing are outside the watched air. With half of it ten seconds on the ground before a flight
+/// of ten minutes would stretch the volume to the ground.
 const LEFT_OUT_SHARE: f64 = 0.025;
-/// Least side of the volume, m: a flight in one plane gets some air around it.
+/// Least side of the volume, m: a flight in one plane gets some air around it. With half of it the
+/// same; without it the volume of a level flight would be empty.
 const LEAST_SIDE_M: f64 = 2.0;
 /// Assumptions as in `plan`: a target is seen for this long, s, and flies straight at this speed,
-/// m/s.
+/// m/s. With half of the time half as many bearings count; with half of the speed errors of clocks
+/// weigh half as much.
 const WINDOW_S: f64 = 1.0;
 const SPEED_MPS: f64 = 15.0;
+/// SD of what is known of its velocity beforehand, m/s per axis: as large as the speed. With half
+/// of it the same where two cameras see the target, as the bearings tell far more.
 const VELOCITY_PRIOR_MPS: f64 = 15.0;
 
 /// Accuracy of a target's position in the air that the flight passed through.
@@ -85,6 +90,7 @@ fn flown_through(result: &FlightResult) -> Option<Volume> {
         let mut along: Vec<f64> = places().map(|place| place[axis]).collect();
         along.sort_unstable_by(f64::total_cmp);
         let last = along.len().checked_sub(1)?;
+        // Sides of the box: the quantiles q and 1 - q of the positions along the axis.
         let beyond = (LEFT_OUT_SHARE * last as f64) as usize;
         let (low, high) = (along[beyond], along[last - beyond]);
         let wider = (0.5 * (LEAST_SIDE_M - (high - low))).max(0.0);

@@ -29,11 +29,14 @@ pub enum HoldOut {
     Blocks,
 }
 
-/// Length of a block, s.
+/// Length of a block, s. Tracks begin anew in each: with half of it they would be missing for twice
+/// as large a share of the time.
 const BLOCK_S: f64 = 10.0;
-/// Log positions count where at least this many cameras see the target.
+/// Log positions count where at least this many cameras see the target. With two, places near the
+/// line through both would count, where no calibration helps.
 const LEAST_CAMERAS: usize = 3;
-/// A track farther than this from the log belongs to something else, m.
+/// A track farther than this from the log belongs to something else, m. With half of it a track
+/// that a bad calibration puts three metres aside would count as missing, not as wrong.
 const CUTOFF_M: f64 = 5.0;
 
 /// The held-out part of a recording.

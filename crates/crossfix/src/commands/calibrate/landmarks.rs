@@ -187,13 +187,16 @@ struct LandmarkResidual {
     deviations: Option<f64>,
 }
 
-/// A pose with a pointing error above this is weak, mrad: half a metre at 100 m.
+/// A pose with a pointing error above this is weak, mrad: half a metre at 100 m. With twice as much
+/// a camera that puts targets a metre aside there would be good.
 const WEAK_POINTING_MRAD: f64 = 5.0;
-/// A lens known in less than this share of the image leaves out targets.
+/// A lens known in less than this share of the image leaves out targets. With half of it a camera
+/// that reports nothing from three fifths of its image would be good.
 const WEAK_SHARE: f64 = 0.8;
 
 /// Lenses are up to 2 % shorter or longer at a distance: a focal length off by more than this share
-/// belongs to another lens, if the clicks do not fit either.
+/// belongs to another lens, if the clicks do not fit either. With half of it such lenses would be
+/// taken for another.
 const WRONG_FOCAL: f64 = 0.03;
 
 /// Whether a camera's calibration is wrong and must not be used.
@@ -202,6 +205,7 @@ fn is_wrong(result: &LandmarkResult) -> bool {
 }
 
 fn is_upside_down(result: &LandmarkResult) -> bool {
+    // Unless the camera is upside down, the image's rows point downwards in the world.
     result.camera.pose().rotation().matrix()[(2, 1)] > 0.5
 }
 

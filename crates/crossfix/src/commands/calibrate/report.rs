@@ -90,7 +90,7 @@ struct DatumFigures {
 }
 
 /// Above these SDs nothing has determined where the site is, how it is turned, or its time: m,
-/// mrad, s.
+/// mrad, s. With half of it the same: what nothing determines keeps SDs that are far above.
 const UNKNOWN: [f64; 3] = [100.0, 1e3, 10.0];
 
 impl std::fmt::Display for DatumFigures {
@@ -167,6 +167,7 @@ impl From<&CameraResult> for CameraFigures {
         let focal_px = camera.intrinsics().fx;
         let clock = &camera.clock;
         let knots = clock.knots.iter();
+        // Wander: the knots' departure from the line through the middle one, from least to most.
         let straight = |knot: &crossfix_calibration::ClockKnot| {
             let middle = &clock.knots[clock.knots.len() / 2];
             knot.ahead_s - middle.ahead_s - clock.rate * (knot.time_s - middle.time_s)

@@ -40,40 +40,49 @@ fn time(text: &str) -> Result<Timestamp, String> {
         .map_err(|_| "a time from 1678 to 2262 is wanted".to_owned())
 }
 
-/// First assumption of a star's pixel SD, pixels; its true value is found from the residuals.
+/// First assumption of a star's pixel SD, pixels; its true value is found from the residuals. With
+/// half of it the same, after one more re-estimate at most.
 const FIRST_SD_PX: f64 = 0.5;
-/// Least SD of a star in any picture, pixels, as samples are whole numbers.
+/// Least SD of a star in any picture, pixels, as samples are whole numbers. With half of it stars
+/// that fit by chance would weigh four times as much.
 const LEAST_SD_PX: f64 = 0.05;
 /// If stars fit no better than this, pixels, the file's lens is wrong, or they are not these stars.
+/// With half of it blurred stars of a good lens would be refused.
 const MOST_SD_PX: f64 = 1.5;
 /// Named stars with residuals of more than this many SDs (by the median star) are misidentified:
-/// faint ones have errors twice as large as that.
+/// faint ones have errors twice as large as that. With half of it one faint star in seven of a
+/// blurred picture would be removed.
 const MOST_DEVIATIONS: f64 = 8.0;
 /// Parameters of the fit: three of the rotation, and nine of a lens with five of distortion.
 const FITTED_NUMBERS: f64 = 12.0;
 /// Least number of stars: the lens has 6 to 9 parameters and the rotation 3, so with fewer stars a
 /// wrong one goes unnoticed.
 const FEWEST_STARS: usize = 12;
-/// With landmarks that do not turn with the sky, the time must be known to within this, s.
+/// With landmarks that do not turn with the sky, the time must be known to within this, s. With
+/// twice as much the sky may be turned against the landmarks by 0.3 mrad (SD), which the lens would
+/// be bent for.
 const MOST_BESIDE_PLACES_S: f64 = 2.0;
 /// Lens models leave errors of less than this, pixels, ...
 const LEAST_BENT_PX: f64 = 0.25;
 /// ... and a lens error shows as a correlation of at least this between neighbouring stars'
-/// residuals.
+/// residuals. With half of the pixels the errors that every model leaves would be taken for another
+/// lens.
 const LEAST_ALIKE: f64 = 0.3;
 /// Distance at which pointing is evaluated for stars, m: so far away that the camera's position
-/// does not count.
+/// does not count. With half of it the same.
 const DISTANT_M: f64 = 1e9;
 /// Most re-estimates of the stars' SD: two or three suffice, the bound is for fits that never
-/// settle.
+/// settle. With half as many the same.
 const MOST_RESCALED: usize = 8;
 /// Most rounds of naming stars. It is repeated while it names more, as each round makes the lens
-/// known in more of the image.
+/// known in more of the image. With half as many, stars near the edges might not be named if the
+/// lens begins far off.
 const MOST_ROUNDS: usize = 10;
 /// Stars are looked for within this many SDs of their predicted pixel, ...
 const GATE: f64 = 4.0;
 /// ... but at least and at most within these distances, pixels: a spot that is not round is found
-/// beside its centre, and farther away than the most there are other stars.
+/// beside its centre, and farther away than the most there are other stars. With half of the SDs
+/// one star in seven would be missed where the lens is not well known.
 const GATES_PX: std::ops::RangeInclusive<f64> = 2.0..=40.0;
 
 /// Finds and identifies the stars of a camera's picture and adds them to its landmarks. Many stars

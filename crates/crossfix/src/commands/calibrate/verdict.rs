@@ -8,27 +8,34 @@ pub const WRONG: &str = "wrong";
 /// A camera with a pointing error above this is weak, mrad: at 100 m a target lies half a metre
 /// aside. With half of it a minute's flight would not do.
 const WEAK_POINTING_MRAD: f64 = 5.0;
-/// A camera with a position error above this is weak, too, m.
+/// A camera with a position error above this is weak, too, m. With twice as much targets may lie a
+/// metre aside at any distance.
 const WEAK_POSITION_M: f64 = 0.5;
-/// A camera whose position error exceeds this share of its range is not calibrated at all.
+/// A camera whose position error exceeds this share of its range is not calibrated at all. With
+/// half of it a camera that a longer flight would place is called wrong instead of weak.
 const NOWHERE: f64 = 0.5;
 /// Nor is one whose rotation is uncertain by more than this, mrad: its covariance holds for small
 /// turns, and the second-order term of a larger one exceeds the labels' errors. Flights that hover
-/// or go straight gave 79 and more, with positions a hundred metres wrong.
+/// or go straight gave 79 and more, with positions a hundred metres wrong. With half of it a camera
+/// that a longer flight would mend is called wrong instead of weak.
 const ANYHOW_MRAD: f64 = 50.0;
-/// Labels with errors above this belong to something else, mrad: lens files leave up to 4.
+/// Labels with errors above this belong to something else, mrad: lens files leave up to 4. With
+/// half of it cameras with such files might be called wrong.
 const WRONG_MRAD: f64 = 8.0;
 /// Errors of labels by hand or by a tracker do not exceed this, pixels, ...
 const WRONG_PX: f64 = 3.0;
 /// ... if it is also more than this, mrad: of a short flight the wrong camera's labels lie no
-/// farther off.
+/// farther off. With half of the pixels good labels made by hand might be refused.
 const WRONG_PX_MRAD: f64 = 2.0;
-/// No clock wanders by more than this within a flight, ms: phones wander by 60.
+/// No clock wanders by more than this within a flight, ms: phones wander by 60. With half of it the
+/// same.
 const WRONG_WANDER_MS: f64 = 300.0;
 /// A focal length that has changed by more than this share belongs to another lens than the file's,
-/// or nothing told the target's distance: lenses change by 2 %.
+/// or nothing told the target's distance: lenses change by 2 %. With half of it cameras with such
+/// lenses would be weak.
 const WEAK_FOCAL: f64 = 0.025;
-/// A camera with a smaller share of fitting labels has also seen something else.
+/// A camera with a smaller share of fitting labels has also seen something else. With half of it
+/// one of which every other label is of something else would be good.
 const WEAK_SHARE: f64 = 0.8;
 /// A camera whose residuals change permanently by more than this has been moved, pixels: of 147
 /// that stood still none changed by more than 1.0, which happens as targets cross other parts of

@@ -7,15 +7,19 @@ use super::{Finding, Verdict};
 use crate::host::kernel_clock_bound;
 use crate::pace::wall_seconds;
 
-/// How long a program may take to answer, and how often it is checked whether it has.
+/// How long a program may take to answer, and how often it is checked whether it has. With half of
+/// it the programs of a busy host may seem to be absent.
 const ANSWER: Duration = Duration::from_secs(5);
 const POLL: Duration = Duration::from_millis(10);
 /// A good clock's error is at most this, s: a target at 20 m/s is then off by a tenth of a metre.
+/// With twice as much a fifth of a metre would pass.
 const GOOD_S: f64 = 0.005;
-/// An error above this is worse than what an agent assumes of a camera, s.
+/// An error above this is worse than what an agent assumes of a camera, s. With half of it clocks
+/// would fail for which agents allow.
 const BEARABLE_S: f64 = 0.1;
 /// A clock last compared longer ago than this is no longer compared at all, s: the longest interval
-/// of time servers is 17 minutes.
+/// of time servers is 17 minutes. With half of it a single comparison that is lost would be a
+/// warning.
 const OLD_S: f64 = 3600.0;
 
 /// What `chronyc -c tracking` says.
@@ -38,6 +42,7 @@ impl ChronyTracking {
         Some(Self {
             server: (*fields.get(1)?).to_owned(),
             compared_s: number(3)?,
+            // NTP's bound: |offset| + root dispersion + root delay / 2.
             bound_s: offset.abs() + dispersion + delay / 2.0,
             is_synchronised: *fields.get(13)? != "Not synchronised",
         })

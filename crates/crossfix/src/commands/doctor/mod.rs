@@ -20,15 +20,20 @@ use crate::config::{self, CameraFile, FileKind, OnvifConfig, load_network};
 use crate::onvif;
 use crate::output;
 
-/// How long a camera is watched, s: long enough for its first clock report.
+/// How long a camera is watched, s: long enough for its first clock report. With half of it one
+/// that reports every five seconds might seem to report nothing.
 const WATCHED_S: f64 = 8.0;
-/// Share of the image interval that decoding may take: the rest is for detecting and tracking.
+/// Share of the image interval that decoding may take: the rest is for detecting and tracking. With
+/// twice as much only half of the interval would be left for that.
 const DECODING_SHARE: f64 = 0.25;
-/// Images more than this many intervals apart have been delayed on the way.
+/// Images more than this many intervals apart have been delayed on the way. With half of it a
+/// single lost image would be taken for a delay.
 const HELD_UP: f64 = 4.0;
-/// Share of images whose loss is acceptable.
+/// Share of images whose loss is acceptable. With half of it the same: of 240 images in eight
+/// seconds one is four times as much.
 const BEARABLE_LOSS: f64 = 0.001;
 /// An image that arrives later than this after its stated capture time has a wrong capture time, s.
+/// With half of it a camera that takes 0.3 s for an image would be suspected.
 const LATEST_S: f64 = 0.5;
 
 /// Find out what keeps a camera host or a site from working, and how to mend it.

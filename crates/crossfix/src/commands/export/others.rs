@@ -86,7 +86,8 @@ fn site_of(recording: &Path) -> anyhow::Result<SiteName> {
 }
 
 /// Tracks earlier than the last by more than this, s, belong to another run and are not merely out
-/// of order.
+/// of order. With half of it a frame that is a second late causes messages that are not due; with
+/// twice as much the beginning of a run that is three seconds earlier is left out.
 const OUT_OF_ORDER_S: f64 = 2.0;
 
 /// Function that writes messages.

@@ -21,6 +21,8 @@ use crate::output;
 use crate::service;
 use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
+/// How long it waits for a message before it checks whether to stop. With twice as much a stop may
+/// come 40 ms late.
 const POLL: Duration = Duration::from_millis(20);
 
 /// Run the fusion centre: bearings in, tracks out.

@@ -16,10 +16,14 @@ use crate::network;
 use crate::output;
 use crate::shutdown::{LEAVE, Shutdown};
 
+/// How long it waits for a message before it checks whether to stop. With twice as much a stop may
+/// come a tenth of a second late.
 const POLL: Duration = Duration::from_millis(50);
 /// Messages queued for a slow client before its oldest are dropped; no other client waits for it.
+/// With half of it a client that pauses loses messages after half of the time.
 const WAITING: usize = 256;
-/// Most topics served; more is taken for an attack.
+/// Most topics served; more is taken for an attack. With half as many the same: a hundred cameras
+/// have some hundreds.
 const MOST_TOPICS: usize = 10_000;
 
 /// The served topics, with a channel each.

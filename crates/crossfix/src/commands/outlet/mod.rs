@@ -27,10 +27,14 @@ use crate::pace::wall_seconds;
 use crate::repeats::Repeats;
 use crate::shutdown::{LEAVE, Shutdown};
 
+/// How long it waits for a message before it checks whether to stop. With twice as much what is due
+/// may go out 40 ms late.
 const POLL: Duration = Duration::from_millis(20);
 /// Older data are useless to receivers, s: an event of Cursor on Target is valid for this long.
+/// With half of it targets would be said to be left out that such receivers still show.
 const STALE_S: f64 = 10.0;
-/// Most events kept for a receiver that is not there; the oldest are dropped.
+/// Most events kept for a receiver that is not there; the oldest are dropped. With half as many one
+/// that comes back hears of the last 500 alone.
 const MOST_EVENTS: usize = 1000;
 
 /// Tell programs of others where the targets are, live.

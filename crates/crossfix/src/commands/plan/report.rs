@@ -8,9 +8,11 @@ use serde::Serialize;
 
 use crate::output;
 
-/// Number of candidate places that are named.
+/// Number of candidate places that are named. Ground and obstacles are not known: with one alone
+/// there would be no other where it is impossible.
 const NAMED: usize = 3;
-/// Least distance between named candidates, as a share of the volume's diagonal.
+/// Least distance between named candidates, as a share of the volume's diagonal. With half of it
+/// one obstacle may exclude all of them.
 const APART: f64 = 0.25;
 
 /// All predictions of a plan.

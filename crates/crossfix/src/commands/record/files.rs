@@ -18,10 +18,13 @@ pub type FileWriter = RecordingWriter<BufWriter<File>>;
 
 const MB: f64 = 1e6;
 const GB: f64 = 1e9;
-/// Removals stop after this many old recordings in a row whose removal freed no space.
+/// Removals stop after this many old recordings in a row whose removal freed no space. With half as
+/// many a disk that frees space late would end them too early; with twice as many twice as many
+/// recordings may be lost for nothing.
 const MOST_IN_VAIN: u32 = 10;
 /// With less free space than this share of what is to be left free, only the messages from which
-/// tracks can be made are recorded.
+/// tracks can be made are recorded. With half of it other messages go on until 25 of the default
+/// 500 MB are left, and those from which tracks are made lack the other 25.
 const LAST_SHARE: f64 = 0.1;
 
 /// How large and how long a file gets, and how much all of them may take.

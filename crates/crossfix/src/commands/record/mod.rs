@@ -26,10 +26,13 @@ use crate::output;
 use crate::service;
 use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
-/// How long the disk may take to store the end of the last file.
+/// How long the disk may take to store the end of the last file. With half of it a power cut soon
+/// after the end may cost the last second on a slow disk.
 const SYNCED_WITHIN: Duration = Duration::from_millis(300);
 /// Most old recordings that are removed before the first file begins.
 const MOST_AT_START: u32 = 100;
+/// How long it waits for a message before it checks whether to stop. With twice as much a stop may
+/// come a tenth of a second late.
 const POLL: Duration = Duration::from_millis(50);
 
 /// Record everything that a site publishes.

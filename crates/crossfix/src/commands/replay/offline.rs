@@ -16,7 +16,8 @@ use crate::recalibration::{Recalibration, Reordered};
 use crate::recorded::{self, Lacks};
 use crate::shutdown::Shutdown;
 
-/// Interval at which the fusion's health is recorded, s of data time.
+/// Interval at which the fusion's health is recorded, s of data time. With twice as much a camera
+/// that is left out for a second may not show.
 const HEALTH_PERIOD_S: f64 = 1.0;
 
 /// State of an offline fusion, with its output.

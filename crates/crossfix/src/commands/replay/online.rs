@@ -20,9 +20,11 @@ use crate::pace::Pace;
 use crate::recorded::{self, Lacks};
 use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 
-/// Time for listeners to connect before the first message, s.
+/// Time for listeners to connect before the first message, s. With half of it listeners that take
+/// longer miss the first messages.
 const RUN_UP_S: f64 = 2.0;
-/// Time between the last message of a pass and the first of the next, s: a few frames.
+/// Time between the last message of a pass and the first of the next, s: a few frames. With half of
+/// it the same.
 const SEAM_S: f64 = 0.1;
 
 /// Whether such messages come from cameras.

@@ -12,15 +12,19 @@ use serde::Serialize;
 use crate::output;
 
 /// A component that has not sent a health message for this long is silent: they are due every
-/// second.
+/// second. With half of it one that is a quarter of a second late would do; with twice as much a
+/// dead component is seen after five seconds.
 const SILENT: Duration = Duration::from_millis(2500);
-/// A track without news for this long has ended.
+/// A track without news for this long has ended. With twice as much a target that is gone is
+/// counted for twice as long.
 const TRACK_LIVES: Duration = Duration::from_secs(2);
 /// Most tracks that are counted. Likewise, components that are no cameras of the network's file are
-/// not shown, so that data from outside cannot fill the memory.
+/// not shown, so that data from outside cannot fill the memory. With half of it the count would end
+/// at 5000.
 const MOST_TRACKS: usize = 10_000;
 
-/// Most problems shown of one component, and characters of each.
+/// Most problems shown of one component, and characters of each. With half of either the last of
+/// many, or the end of a long one, would be missing.
 const MOST_PROBLEMS: usize = 10;
 const MOST_LETTERS: usize = 200;
 

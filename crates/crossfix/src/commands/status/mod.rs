@@ -18,10 +18,14 @@ use crate::network;
 use crate::output;
 use crate::shutdown::{LEAVE, Shutdown};
 
-/// Interval at which the screen is redrawn.
+/// Interval at which the screen is redrawn. Health comes as often: with half of it most is drawn
+/// twice.
 const PERIOD: Duration = Duration::from_secs(1);
 /// Time after which every component has been heard: a second to connect, and one between messages.
+/// With half of it those whose message was about to come would not be heard.
 const HEARD_AFTER: Duration = Duration::from_secs(3);
+/// How long it waits for a message before it checks whether to draw or to stop. With twice as much
+/// both may come a tenth of a second late.
 const POLL: Duration = Duration::from_millis(50);
 /// Escape sequence that moves to the upper left corner and clears the screen.
 const CLEARED: &str = "\x1b[H\x1b[2J";

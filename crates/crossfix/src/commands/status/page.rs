@@ -24,11 +24,14 @@ const PAGE: &str = include_str!("page.html");
 const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
                       connect-src 'self'; img-src data:";
 /// Most clients that receive events at the same time; further ones are told to try again later.
-/// Other requests need connections of their own ([`http::ASKING`]).
+/// Other requests need connections of their own ([`http::ASKING`]). With half as many the seventh
+/// client would be told so.
 const TOLD: usize = 12;
 /// A client must connect again after this time, so that one that reads nothing frees its place.
+/// With twice as much such a place is free after two minutes.
 const TOLD_FOR: Duration = Duration::from_secs(60);
-/// Interval of the events sent to the page.
+/// Interval of the events sent to the page. With half of it each client receives twice as much;
+/// with twice as much a target at 20 m/s jumps by 8 m.
 pub const PERIOD: Duration = Duration::from_millis(200);
 
 /// Data of one event for the page.

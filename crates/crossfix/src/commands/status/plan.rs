@@ -11,11 +11,13 @@ use crossfix_message::{
 use nalgebra::Vector3;
 use serde::Serialize;
 
-/// A track without news for this long has ended.
+/// A track without news for this long has ended. With twice as much a target that is gone is drawn
+/// for twice as long.
 const TRACK_LIVES: Duration = Duration::from_secs(2);
-/// Most tracks that are drawn: with more the plan is unreadable.
+/// Most tracks that are drawn: with more the plan is unreadable. With half as many a swarm of more
+/// than 500 would be drawn in part.
 const MOST_TRACKS: usize = 1000;
-/// Number of events that are shown.
+/// Number of events that are shown. With half as many what was before the last 50 would be gone.
 const MOST_EVENTS: usize = 100;
 
 /// A camera on the plan.

@@ -23,7 +23,8 @@ const ROW: u32 = 18;
 const FRAME: u32 = 110;
 /// Approximate width of a letter in the small font, px.
 const LETTER: usize = 7;
-/// Positive figures that differ by more than this factor are drawn on a logarithmic axis.
+/// Positive figures that differ by more than this factor are drawn on a logarithmic axis. With
+/// twice as much figures of 1 and 2 may lie a hundredth of the axis apart.
 const WIDE: f64 = 50.0;
 
 const OURS: RGBColor = RGBColor(31, 90, 160);

@@ -10,6 +10,7 @@ use crossfix_view::{GroundPicture, Picture, RecordingStream};
 use crate::commands::numbers;
 
 /// Longest side of a picture of the ground, pixels: every graphics card takes this as one texture.
+/// With half of it a site of more than two kilometres could not have half a metre per pixel.
 const MOST_SIDE: usize = 8192;
 
 #[derive(Debug, Default, clap::Args)]

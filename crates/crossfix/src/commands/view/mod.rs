@@ -102,11 +102,14 @@ fn draw_recording(mut picture: Picture, recording: &Path) -> anyhow::Result<()> 
     picture.finish().context("the picture is not complete")
 }
 
-/// How often it is checked which components are present, and whether the viewer still is.
+/// How often it is checked which components are present, and whether the viewer still is. With
+/// twice as much a viewer that was closed is noticed two seconds later.
 const LOOK_PERIOD: Duration = Duration::from_secs(1);
-/// A viewer that takes longer than this for one message cannot keep up.
+/// A viewer that takes longer than this for one message cannot keep up. With half of it one that
+/// pauses for a second, and then catches up, would be warned about.
 const STALL: Duration = Duration::from_secs(2);
-/// How long a viewer gets to receive what was drawn last.
+/// How long a viewer gets to receive what was drawn last. With half of it a slow one may lack the
+/// end.
 const LAST_LOOK: Duration = Duration::from_secs(1);
 
 fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {

@@ -18,7 +18,8 @@ use super::super::table::{Limit, Table, TableRow, deviation, mean, share};
 use super::site::{PERIODS, PaperSite, StraightTarget, line, tangent_noise};
 use super::{REFERENCE_RUNS, reference_tolerance};
 
-/// Number of runs of a cell for each run of the options: a run takes a tenth of a millisecond.
+/// Number of runs of a cell for each run of the options: a run takes a tenth of a millisecond. With
+/// half of it standard errors are 1.4 times as large.
 const CHEAP: usize = 10;
 /// A target is found if a group ends within this distance of it, m.
 const MATCH_GATE: f64 = 4.1;
@@ -26,7 +27,8 @@ const MATCH_GATE: f64 = 4.1;
 const POSITION_SD: f64 = 0.1;
 /// The spatial gate of two receivers, m^2: `J <= beta`, Klochko 2020, eq. 9. The lines of a true
 /// pair miss each other by what the target moves in the delay, up to 3.9 m SD, and the algorithm
-/// does not model that, so the gate is four of these deviations.
+/// does not model that, so the gate is four of these deviations. With two, one true pair in 22
+/// would be refused.
 const PAIR_GATE: f64 = 4.0 * 3.9 * 4.0 * 3.9;
 
 /// Velocity scale for deciding the rank, m/s: the paper has no prior on velocities. With 15.6, as

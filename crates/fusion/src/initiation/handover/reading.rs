@@ -13,7 +13,8 @@ use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
 /// Two cameras that have both seen something for longer than this, s, without a track coming of it,
-/// see different things.
+/// see different things. With half of it an overlap that is too short for a track already forbids
+/// the handover.
 pub(super) const TOGETHER_S: f64 = 1.0;
 
 /// Parameters from the site's configuration.

@@ -23,11 +23,12 @@ const TURNING_SD: f64 = 0.3;
 /// it, what turns hard is lost; with twice as much, two directions are too soon alike.
 pub(super) const TURNING_DENSITY: f64 = 3e-4;
 /// Standard deviation of the logarithm of an unknown range: the density at its middle is as if all
-/// ranges over a factor of 150 were equally likely.
+/// ranges over a factor of 150 were equally likely. With half of it (a factor of 12) lines that
+/// cross by chance gain 0.7 in log-likelihood.
 const UNKNOWN_LOG_RANGE_SD: f64 = 2.0;
 /// A camera has lost sight of a direction if the probability of missing it so often by chance is
 /// below exp of this: once in 100 times, which is two exposures of a camera that reports nine of
-/// ten.
+/// ten. With half of it a single miss is a loss.
 const LOST: f64 = -4.6;
 
 /// A direction that one camera alone follows, at the time of its last line.

@@ -9,11 +9,14 @@ use plotters::prelude::*;
 
 use super::panel::{Area, Chart, FIRST, Failure, Words, frame, nothing};
 
-/// Number of cells of an image, across and down.
+/// Number of cells of an image, across and down. With half as many each way, the mean of a cell
+/// would hide how the lens bends within it.
 const CELLS: [usize; 2] = [16, 9];
-/// A cell with fewer labels than this shows nothing.
+/// A cell with fewer labels than this shows nothing. With half as many the SD of a cell's mean is
+/// almost half a label's, and arrows show noise.
 const LEAST_LABELS: u32 = 10;
-/// Length of the arrows' 90 % quantile as drawn, as a share of a cell.
+/// Length of the arrows' 90 % quantile as drawn, as a share of a cell. With twice as much they
+/// would cross into other cells.
 const ARROW_SHARE: f64 = 0.9;
 
 /// A plot frame for an image, with rows counted downwards.
@@ -60,6 +63,7 @@ pub fn mean_residuals(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fail
     let size = camera.camera.model().intrinsics().size;
     let [across, down] = cell_px(size);
     let mut cells: BTreeMap<(usize, usize), (Vector2<f64>, u32)> = BTreeMap::new();
+    // Larger residuals belong to something else.
     let within = 5.0 * camera.noise.sd_px();
     for label in camera.fitted.iter().filter(|label| label.beside_px.amax() < within) {
         let cell = ((label.pixel.x() / across) as usize, (label.pixel.y() / down) as usize);

@@ -15,7 +15,8 @@ pub type Chart<'a, 'b> =
 pub const FIRST: RGBColor = RGBColor(31, 90, 160);
 pub const SECOND: RGBColor = RGBColor(200, 70, 20);
 
-/// Most points drawn of a series: the eye sees no more, and the file stays small.
+/// Most points drawn of a series: the eye sees no more, and the file stays small. With half as many
+/// a short excursion is more often skipped.
 const MOST_POINTS: usize = 1500;
 
 /// Title and axis labels of a panel.

@@ -9,16 +9,21 @@ use super::panel::{
 };
 
 /// Residuals up to this many SDs are shown: larger ones belong to something else, and are counted.
+/// With half of it one good label in forty would be counted, too.
 const SHOWN: f64 = 5.0;
-/// A target that moves more slowly in the image tells nothing about clocks, pixels/s.
+/// A target that moves more slowly in the image tells nothing about clocks, pixels/s. With half of
+/// it an error of one pixel would be drawn as 100 ms instead of 50.
 const LEAST_MOTION_PX_PER_S: f64 = 20.0;
 /// Medians are taken over this time, s: errors of labels are correlated for up to a second or two.
+/// With half of it successive medians share errors, which look like a clock that wanders.
 const BLOCK_S: f64 = 3.0;
-/// Bars of a histogram.
+/// Bars of a histogram. With half as many each would be 0.4 SDs wide.
 const BARS: usize = 50;
 /// Correlations are shown up to the longest time for which errors of labels may be correlated, s.
+/// With half of it one that lasts so long looks as if it never ended.
 const LONGEST_LAG_S: f64 = 3.0;
-/// Number of lags at which the correlation is estimated.
+/// Number of lags at which the correlation is estimated. With half as many a correlation that lasts
+/// for less than 0.15 s would not show.
 const LAGS: usize = 40;
 
 /// The residuals of both axes, over the camera's own time.
@@ -84,6 +89,7 @@ pub fn histogram(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
     let title = format!("in deviations of {:.2} px, and a normal curve", noise.sd_px());
     let width = 2.0 * SHOWN / BARS as f64;
     let mut bars = [0.0; BARS];
+    // A density: a bar's area is its share of all residuals, of which each label has two.
     let share = 0.5 / camera.fitted.len().max(1) as f64;
     for label in &camera.fitted {
         for axis in [0, 1] {
