@@ -3,6 +3,7 @@
 //! told apart.
 
 use crate::motion::MotionSetup;
+use crate::tracker::association::MAX_SCORE;
 use crate::{
     ConfigError, FlightModel, FusionConfig, InitiationMethod, Manoeuvres, SpatialSolver, Weighting,
 };
@@ -148,7 +149,7 @@ impl FusionConfig {
             range("tracking.residual_scale", it.residual_scale, 1e-3, 1e3),
             range("tracking.innovation_window", it.innovation_window as f64, 1.0, 1000.0),
             range("tracking.clutter_per_sr", it.clutter_per_sr, 1e-9, 1e6),
-            range("tracking.confirm_score", it.confirm_score, 1e-3, 1e3),
+            range("tracking.confirm_score", it.confirm_score, 1e-3, MAX_SCORE),
             range("tracking.coasting_after_s", it.coasting_after_s, 1e-3, 3600.0),
             range("tracking.lost_after_s", it.lost_after_s, 1e-3, 3600.0),
             range("tracking.max_position_sd_m", it.max_position_sd_m, 1e-3, 1e5),

@@ -1,7 +1,7 @@
 //! The tracks of the site: association of an exposure's bearings, confirmation, coasting, loss and
 //! merging.
 
-mod association;
+pub(crate) mod association;
 mod life;
 
 use std::collections::BTreeMap;
@@ -28,9 +28,9 @@ const MERGE_GATE: f64 = 11.34;
 const PUBLISHED_EVERY_S: f64 = 0.5;
 /// A track that two cameras alone see says how well poses are known from this age on, s: before,
 /// the two may see different things that pass each other, and would make room for more such tracks.
-/// With half of it they do; with twice as much two cameras take as much longer to show that they
-/// err.
+/// Without it they do; with twice as much two cameras take as much longer to show that they err.
 const OF_ONE_S: f64 = 5.0;
+
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct TrackChange {

@@ -5,7 +5,7 @@ use super::course::Course;
 use super::error::{FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal};
 use super::model::{CameraLabels, CameraUnknowns, FlightLog, frame_time, hours};
 use super::pairs::{self, RelativePose, Sights};
-use super::spline::TrajectorySpline;
+use super::spline::{KNOT_S, TrajectorySpline};
 use super::state::{CameraPriors, FlightState, Priors, RATE_SD};
 use super::would_fit::WouldFit;
 use super::{start, things, triangulation, would_fit};
@@ -35,7 +35,7 @@ const MARGIN_S: f64 = 2.0;
 /// Two cameras see the target together if they do so within this time, s: that of a knot of the
 /// trajectory. With half of it labels are lost where the other cameras have fewer than five a
 /// second.
-const TOGETHER_S: f64 = 0.2;
+const TOGETHER_S: f64 = KNOT_S;
 /// Without a log, this many pairs of cameras are tried as a start, those of least doubt: one that
 /// saw a short or a flat piece of the trajectory leads astray. With half of it such a pair may be
 /// the only one.

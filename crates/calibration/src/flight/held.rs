@@ -1,5 +1,7 @@
 //! Where no log places a site, an earlier calibration of it does.
 
+use crossfix_message::Datum;
+
 use super::results::{CameraResult, FlightResult};
 use crate::survey::Survey;
 
@@ -7,8 +9,6 @@ use crate::survey::Survey;
 /// a weighted mean of zero deviations does not exist. With half of it a clock that is stated better
 /// counts four times as much, and may decide alone.
 const LEAST_CLOCK_SD_S: f64 = 1e-3;
-/// Index of the lateness among the datum's components.
-const LATE: usize = 7;
 
 /// Keeps a site as a whole where an earlier calibration has it: its datum may be off by what was
 /// stated then. The common time is the one that the cameras' clocks showed by their earlier
@@ -23,7 +23,7 @@ pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey) {
         camera.fitted.iter_mut().for_each(|label| label.time_s += later_s);
     }
     if let Some(datum) = &mut result.datum {
-        datum.covariance[(LATE, LATE)] += sd_s * sd_s;
+        datum.covariance[(Datum::LATE, Datum::LATE)] += sd_s * sd_s;
     }
 }
 

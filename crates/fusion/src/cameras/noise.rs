@@ -8,6 +8,8 @@
 //! the two together tell the white part of a camera's noise from the lasting part, whatever the
 //! track believes.
 
+use std::f64::consts::LN_2;
+
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector2, Vector3};
@@ -15,9 +17,9 @@ use nalgebra::{Unit, Vector2, Vector3};
 use crate::uncertainty::CorrelatedNoise;
 
 /// Median of a chi-square of two degrees of freedom.
-const MEDIAN: f64 = 1.386_294;
+const MEDIAN: f64 = 2.0 * LN_2;
 /// Increase of the share of draws below the median per unit of the logarithm of the scale.
-const SLOPE: f64 = 0.346_574;
+const SLOPE: f64 = LN_2 / 2.0;
 /// Number of draws that the estimate remembers: it is then known to 13 %. With half as many a
 /// camera must report a third of its variance before that is noticed, and not half of it.
 const MEMORY: f64 = 200.0;

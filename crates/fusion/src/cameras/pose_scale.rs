@@ -41,8 +41,9 @@ const MOST: f64 = 1e6;
 /// Largest factor (variance) on a pose that is declared. With half of it a camera that errs by
 /// twice what it declares is taken to err by 1.4 times that, and draws targets towards its lines.
 const DECLARED_MOST: f64 = 4.0;
-/// A camera whose errors are more than this many times (variance) the declared ones is doubted.
-/// With half of it one that errs by more than 2.1 deviations is, and not only by more than 3.
+/// A camera whose pose nobody has declared, and whose errors are more than this many times
+/// (variance) those of a careful survey, is doubted. With half of it one that errs by more than 2.1
+/// deviations is, and not only by more than 3.
 const DOUBTED: f64 = 9.0;
 /// Changes of an estimate (logarithm) by less than this change no track. With half of it tracks are
 /// told up to twice as often, and gain nothing: it is 5 % of a deviation.

@@ -2,6 +2,8 @@
 //! Detectors report such objects again and again in the same place, and the lines of two cameras to
 //! two of them cross as a target's do.
 
+use std::cmp::Reverse;
+
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector3};
@@ -96,6 +98,16 @@ impl ReportedPlaces {
         lines.map(|line| self.report(time, began, before, line)).collect()
     }
 
+    /// Forgets the place that has not been reported for longest; of several, the one that is known
+    /// for the shortest time.
+    fn forget_one(&mut self) {
+        let places = self.places.iter().enumerate();
+        let least = places.min_by_key(|(_, place)| (place.last, Reverse(place.first)));
+        if let Some((index, _)) = least {
+            self.places.remove(index);
+        }
+    }
+
     fn report(
         &mut self,
         time: Timestamp,
@@ -115,7 +127,7 @@ impl ReportedPlaces {
             near.filter(|(away, _)| *away <= REACH_RAD.powi(2)).min_by(|a, b| a.0.total_cmp(&b.0));
         let Some((_, place)) = nearest else {
             if self.places.len() >= MAX_PLACES {
-                self.places.remove(0);
+                self.forget_one();
             }
             let (middle, start) = (line.direction, line.direction);
             self.places.push(ReportedPlace {
@@ -146,5 +158,34 @@ impl ReportedPlaces {
             return if may_be_old(place.first) { Rooted::Unknown } else { Rooted::No };
         }
         if place.reports >= LEAST_SHARE * exposures { Rooted::Yes } else { Rooted::No }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Point3;
+
+    use super::*;
+    use crate::spatial::tests_support::line_at;
+
+    #[test]
+    fn a_flood_of_bearings_pushes_no_tree_out_of_the_memory() {
+        let line = |k: u32| {
+            let (x, z) = (f64::from(k % 50) - 25.0, f64::from(k / 50) - 25.0);
+            line_at(Point3::origin(), Point3::new(4.0 * x, 100.0, 4.0 * z), 0.0).line
+        };
+        let mut places = ReportedPlaces::new(1.5);
+        let (tree, mut seconds) = (line(0), 0.0);
+        let mut at = |lines: &[SightLine], places: &mut ReportedPlaces| {
+            seconds += 0.1;
+            places.see(Timestamp::from_seconds(seconds), lines.iter())[0]
+        };
+        for _ in 0..30 {
+            at(&[tree], &mut places);
+        }
+        assert_eq!(at(&[tree], &mut places), Rooted::Yes);
+        let flood: Vec<SightLine> = std::iter::once(tree).chain((1..2500).map(line)).collect();
+        at(&flood, &mut places);
+        assert_eq!(at(&[tree], &mut places), Rooted::Yes);
     }
 }

@@ -28,8 +28,7 @@ const MAX_ROUNDS: usize = 25;
 /// With half of either the same: it changes by factors of ten.
 const FIRST_DAMPING: f64 = 1e-4;
 const MAX_DAMPING: f64 = 1e4;
-/// A descent has settled when an iteration lowers the sum of squared distances by less than this.
-/// With half of it the same.
+/// A descent ends when the sum of squared distances falls by less than this. With half, the same.
 const SETTLED: f64 = 1e-3;
 /// Densities of the jerk that are tried, m^2/s^5, as powers of ten: from a straight line to the
 /// turns of a racing drone.
@@ -143,8 +142,8 @@ impl<'a> Adjustment<'a> {
         Self { sights, curve, prior, scales: vec![1.0; prior.cameras.len()], weights }
     }
 
-    /// Fits trajectory, clocks and poses. `None` if the numbers fail. Evidences can be compared
-    /// between fits of the same weights.
+    /// Fits trajectory, clocks and poses; `None` if the numbers fail. Evidences compare for equal
+    /// weights.
     pub(super) fn solve(mut self, density: i32) -> Option<AdjustedCameras> {
         // Huber's loss still draws the far ones in, while all may be far off; the trimmed one, from
         // then on, lets strangers go.

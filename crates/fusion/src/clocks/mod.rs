@@ -110,9 +110,9 @@ struct Round {
 }
 
 /// Time over which a clock's random walk is counted, s: a clock that wanders by the least deviation
-/// within it is not taken at its word. As long as a window of the estimate. With half of it one may
-/// wander 1.4 times as far and is taken at its word.
-const WALK_S: f64 = 8.0;
+/// within it is not taken at its word. With half of it one may wander 1.4 times as far and is taken
+/// at its word.
+const WALK_S: f64 = WINDOW_S;
 
 /// Estimates the clocks of all cameras.
 #[derive(Clone, Debug)]

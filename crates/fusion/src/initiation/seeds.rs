@@ -33,11 +33,6 @@ const MAX_CLOSE_PAIRS: usize = 20_000;
 /// Once more seeds than this have been found, no more pairs are tried: if many bearings are alike,
 /// every combination of them is as good as any other. Half of it is still five times [`MAX_SEEDS`].
 const MAX_FOUND: usize = 20_000;
-/// Most pairs of lines tried for two cameras: time is bounded, whatever a camera reports.
-/// [`MAX_LINES`](super::MAX_LINES) against as many: with half of it the later lines of a full
-/// exposure begin no pair.
-const MAX_PAIRS: usize = 250_000;
-
 /// Up to this distance from the nearest camera new targets are as dense as `birth_density_per_m3`
 /// says, m: at a kilometre a small drone is one pixel of an ordinary camera (0.5 mrad). Beyond it
 /// the density of those that are seen falls with the cube of the distance, so that each factor of
@@ -116,12 +111,9 @@ impl SeedFinder {
         let mut seeds = Vec::new();
         let mut close = 0;
         for (a, b) in self.pairs_of_cameras(&growing) {
-            let mut tried = 0;
             for i in 0..lines[a].len() {
                 for j in 0..lines[b].len() {
-                    tried += 1;
-                    let enough =
-                        tried > MAX_PAIRS || close > MAX_CLOSE_PAIRS || seeds.len() > MAX_FOUND;
+                    let enough = close > MAX_CLOSE_PAIRS || seeds.len() > MAX_FOUND;
                     // A line on which four cameras agree needs no other set.
                     if settled[a][i] || settled[b][j] || enough {
                         continue;

@@ -19,7 +19,7 @@ const REACH: f64 = 1.5;
 /// Upper limit of a track's score: a track that has long been good can still be doubted. With half
 /// of it no tentative track reaches the default score of confirmation; with twice as much a ghost
 /// lives for twice as many misses.
-const MAX_SCORE: f64 = 40.0;
+pub(crate) const MAX_SCORE: f64 = 40.0;
 /// Bearings within this angle of a target's expected direction count as beside it, rad: a camera
 /// that is turned by no more than this shows the target there. With half of it a camera turned by
 /// four degrees is not accused; with twice as much, what else is in the view counts against a good
