@@ -257,8 +257,8 @@ pub struct Tracking {
     pub detection_probability: f64,
     /// Density of false bearings, 1/sr. 1e-9 to 1000000. Default 5.
     pub clutter_per_sr: f64,
-    /// Log-likelihood ratio (target against clutter) that confirms a track. 0.001 to 40: no score is
-    /// larger. Default 25.
+    /// Log-likelihood ratio (target against clutter) that confirms a track. 0.001 to 40: no score
+    /// is larger. Default 25.
     pub confirm_score: f64,
     /// A confirmed track not updated for this long is coasting, and a camera that has not seen a
     /// target for this long no longer counts as holding (supporting) its track, s. 0.001 to 3600.

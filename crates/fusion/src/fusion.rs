@@ -1,3 +1,4 @@
+mod correcting;
 mod jumps;
 mod saying;
 mod smoothing;
@@ -19,6 +20,7 @@ use crate::motion::MotionSetup;
 use crate::site_time::{FrameDecision, SiteTime, moved};
 use crate::track::{Track, TrackId};
 use crate::tracker::{TrackChange, Tracker};
+use correcting::SaidTime;
 use smoothing::Smoothing;
 
 use crate::uncertainty::{CorrelatedNoise, pose_covariance_of_careful_survey};
@@ -56,15 +58,10 @@ pub struct CameraReport {
     pub clock: Option<ClockEstimate>,
 }
 
-/// What a camera said of an exposure's time, and by which estimate of its clock that was corrected.
-#[derive(Clone, Copy, Debug)]
-struct Reported {
-    time: Timestamp,
-    /// Standard deviation, s.
-    sd_s: f64,
-    /// [`ClockEstimator::changes`] as of the correction.
-    known: u64,
-}
+/// What two cameras alone show of their poses counts once their track is this old, s: before, the
+/// two may see different things that pass each other, and would make room for more such tracks.
+/// Without it they do; with twice as much two cameras take as much longer to show that they err.
+const PAIR_BELIEVED_AFTER_S: f64 = 5.0;
 
 /// The fusion centre as a state machine: frames in, tracks out; without clock, thread or socket of
 /// its own.
@@ -79,7 +76,9 @@ pub struct Fusion {
     unmet: Unmet,
     site_time: SiteTime,
     /// Exposures ordered by capture time less the estimated offset of their camera's clock.
-    corrected: ReorderQueue<Reported>,
+    corrected: ReorderQueue<SaidTime>,
+    /// [`ClockEstimator::changes`] as of these corrections.
+    corrected_by: u64,
     smoothing: Smoothing,
     cueing: Cueing,
     counters: Counters,
@@ -105,6 +104,7 @@ impl Fusion {
             unmet: Unmet::new(&config.initiation),
             site_time: SiteTime::new(config.event_time.lateness_s),
             corrected: ReorderQueue::default(),
+            corrected_by: 0,
             smoothing: Smoothing::new(config.tracking.smoothing_s),
             cueing: Cueing::default(),
             counters: Counters::default(),
@@ -285,50 +285,6 @@ impl Fusion {
         outputs.push(Output::Rejected(rejection));
     }
 
-    /// Subtracts the clock's estimated offset from an exposure's time. The corrected times may come
-    /// in another order, so an exposure waits until no camera's clock can be far enough ahead for
-    /// an earlier exposure still to come.
-    fn correct(&mut self, exposure: Exposure, outputs: &mut Vec<Output>) {
-        self.clocks.see(&exposure.camera, &exposure.uncertainty);
-        if self.clock(&exposure.camera).is_none() {
-            return self.process(&exposure, outputs);
-        }
-        let time = exposure.time;
-        let said = Reported { time, sd_s: exposure.uncertainty.time_sd_s, known: 0 };
-        self.wait(exposure, said, outputs);
-        // No exposure to come can be corrected to before this: times come in order, less the
-        // largest offset.
-        let settled = time.plus_seconds(-self.clocks.largest_offset());
-        while let Some((next, said)) = self.corrected.pop_settled(Some(settled)) {
-            // Of one clock no two estimates may be in use by turns: tracks would take each change
-            // for news of their errors.
-            if said.known == self.clocks.changes() {
-                self.process(&next, outputs);
-            } else {
-                self.wait(next, said, outputs);
-            }
-        }
-    }
-
-    /// Corrects the time of an exposure by what is known of the clocks now, and keeps the exposure
-    /// until nothing can come before it.
-    fn wait(&mut self, mut exposure: Exposure, said: Reported, outputs: &mut Vec<Output>) {
-        if let Some(clock) = self.clock(&exposure.camera) {
-            exposure.correction_s = clock.offset_s;
-            exposure.time = said.time.plus_seconds(-clock.offset_s);
-            let sd_s = self.clocks.time_sd_s(&exposure.camera, &clock, said.sd_s);
-            exposure.uncertainty.time_sd_s = sd_s;
-        }
-        if let Some(by_s) = self.buffer.passed_by_s(exposure.time) {
-            return self.refuse(exposure.refused(RejectionReason::Late { by_s }), outputs);
-        }
-        if self.corrected.holds(&exposure, said.time) {
-            return self.refuse(exposure.refused(RejectionReason::Duplicate), outputs);
-        }
-        let known = self.clocks.changes();
-        self.corrected.insert(exposure, said.time, Reported { known, ..said });
-    }
-
     /// The standard deviation of an exposure's time against true time, s.
     fn true_time_sd_s(&self, exposure: &Exposure) -> f64 {
         let clock = self.clock(&exposure.camera);
@@ -371,12 +327,12 @@ impl Fusion {
         } else {
             self.follow(&exposure, &mut changes)
         };
-        for samples in self.tracker.draws() {
+        for (age_s, samples) in self.tracker.draws() {
             // The error of a mount's angles is a new one after each turn: cameras on mounts are
             // left out.
             let is_fixed = |sample: &ScaleSample| !self.cameras.is_on_mount(&sample.camera);
             let samples: Vec<ScaleSample> = samples.into_iter().filter(is_fixed).collect();
-            if samples.len() < 2 {
+            if samples.len() < if age_s < PAIR_BELIEVED_AFTER_S { 3 } else { 2 } {
                 continue;
             }
             self.cameras.watch(&samples, exposure.time);

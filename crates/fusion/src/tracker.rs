@@ -26,10 +26,6 @@ const MERGE_GATE: f64 = 11.34;
 /// Every track's state is published at least this often, s. With half of it a track that coasts
 /// makes twice as many messages; with twice as much, neighbouring centres take it for ended.
 const PUBLISHED_EVERY_S: f64 = 0.5;
-/// A track that two cameras alone see says how well poses are known from this age on, s: before,
-/// the two may see different things that pass each other, and would make room for more such tracks.
-/// Without it they do; with twice as much two cameras take as much longer to show that they err.
-const OF_ONE_S: f64 = 5.0;
 
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -274,13 +270,11 @@ impl Tracker {
     }
 
     /// The cameras' mean offsets from confirmed targets, by target, for those whose comparison is
-    /// due.
-    pub(crate) fn draws(&mut self) -> Vec<Vec<ScaleSample>> {
+    /// due; each with the age of its track, s.
+    pub(crate) fn draws(&mut self) -> Vec<(f64, Vec<ScaleSample>)> {
         let sure = self.tracks.values_mut().filter(|track| track.is_confirmed() && track.is_held());
-        let draws = sure.map(|track| (track.age_s(), track.draw()));
-        let least = |age_s: f64| if age_s < OF_ONE_S { 3 } else { 2 };
-        let enough = draws.filter(|(age_s, samples)| samples.len() >= least(*age_s));
-        enough.map(|(_, samples)| samples).collect()
+        let drawn = sure.map(|track| (track.age_s(), track.draw()));
+        drawn.filter(|(_, samples)| samples.len() >= 2).collect()
     }
 
     /// Passes on that a camera's pose error variance was found to be `ratio` times what was

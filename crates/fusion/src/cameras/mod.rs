@@ -42,7 +42,7 @@ use watch::ErrorWatch;
 
 pub(crate) use calibration::KnownCamera;
 pub(crate) use clutter::view_sr;
-pub(crate) use noise::{RecentBearings, ThirdDifferences};
+pub(crate) use noise::{LASTING_S, RecentBearings, ThirdDifferences};
 pub(crate) use pointing::Pointed;
 pub(crate) use pose_scale::ScaleSample;
 pub(crate) use rooted::Rooted;

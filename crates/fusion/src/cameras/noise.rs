@@ -47,7 +47,7 @@ const SPACING_S: f64 = 0.25;
 /// Correlation time of the part that lasts, where nobody has declared it, s. From the spaced
 /// differences only the rate of change of the error follows, variance over time, and not each for
 /// itself: with half of the time the variance found is half as large, and the rate is the same.
-const LASTING_S: f64 = 1.0;
+pub(crate) const LASTING_S: f64 = 1.0;
 
 /// Squared third differences of a camera's bearings of a target, over their variance by the
 /// reported noise (two degrees of freedom each, if that is right).

@@ -98,7 +98,7 @@ impl PoseScale {
         self.told
     }
 
-    /// Whether the camera's lines miss the others' by far more than is declared of it.
+    /// Whether the camera's lines miss the others' by far more than a careful survey leaves.
     pub(super) fn is_doubted(&self) -> bool {
         self.told > DOUBTED
     }

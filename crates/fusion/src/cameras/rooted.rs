@@ -2,8 +2,6 @@
 //! Detectors report such objects again and again in the same place, and the lines of two cameras to
 //! two of them cross as a target's do.
 
-use std::cmp::Reverse;
-
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector3};
@@ -31,9 +29,9 @@ const CLUTTER_SHARE: f64 = 0.03;
 /// been there before. An object seen in three exposures of ten, at 30 a second, appears later than
 /// that (0.3 s of 1.5) in one case of 25; with half of it in one of six.
 const BEGINNING: f64 = 0.2;
-/// Most places that are remembered of a camera, the latest ones: clutter cannot fill the memory.
-/// With half of it a view of more than 500 leaves and lights takes those it has known longest for
-/// new ones.
+/// Most places that are remembered of a camera, those that are reported most often: clutter cannot
+/// fill the memory. With half of it a view of more than 500 leaves and lights takes some of them
+/// for new ones.
 const MAX_PLACES: usize = 1_000;
 
 /// Whether a bearing is of something that stands in its camera's view for good.
@@ -98,13 +96,14 @@ impl ReportedPlaces {
         lines.map(|line| self.report(time, began, before, line)).collect()
     }
 
-    /// Forgets the place that has not been reported for longest; of several, the one that is known
-    /// for the shortest time.
+    /// Forgets the place that has been reported least often; of several, the newest one.
     fn forget_one(&mut self) {
+        let order = |one: &ReportedPlace, other: &ReportedPlace| {
+            one.reports.total_cmp(&other.reports).then(other.first.cmp(&one.first))
+        };
         let places = self.places.iter().enumerate();
-        let least = places.min_by_key(|(_, place)| (place.last, Reverse(place.first)));
-        if let Some((index, _)) = least {
-            self.places.remove(index);
+        if let Some((index, _)) = places.min_by(|(_, one), (_, other)| order(one, other)) {
+            self.places.swap_remove(index);
         }
     }
 
@@ -184,7 +183,7 @@ mod tests {
             at(&[tree], &mut places);
         }
         assert_eq!(at(&[tree], &mut places), Rooted::Yes);
-        let flood: Vec<SightLine> = std::iter::once(tree).chain((1..2500).map(line)).collect();
+        let flood: Vec<SightLine> = (1..2500).map(line).chain(std::iter::once(tree)).collect();
         at(&flood, &mut places);
         assert_eq!(at(&[tree], &mut places), Rooted::Yes);
     }

@@ -30,8 +30,7 @@ const FIRST_DAMPING: f64 = 1e-4;
 const MAX_DAMPING: f64 = 1e4;
 /// A descent ends when the sum of squared distances falls by less than this. With half, the same.
 const SETTLED: f64 = 1e-3;
-/// Densities of the jerk that are tried, m^2/s^5, as powers of ten: from a straight line to the
-/// turns of a racing drone.
+/// Densities of the jerk that are tried, m^2/s^5, powers of ten: straight lines to racing drones.
 const DENSITIES: std::ops::RangeInclusive<i32> = -5..=4;
 
 /// Robust loss: how hard a bearing pulls.
@@ -188,9 +187,10 @@ impl<'a> Adjustment<'a> {
             // Up to three standard errors (of the median; four of the mean) above 1 are chance for
             // a camera whose covariances are right. The squares hold the factor so far.
             let found = typical * *scale;
-            let next = if found < 1.0 + 4.0 / count.sqrt() { 1.0 } else { found };
+            let is_chance = found < 1.0 + 4.0 / count.sqrt();
+            let next = if is_chance { 1.0 } else { found.min(MAX_SCALE) };
             changed |= (next / *scale - 1.0).abs() > 0.1;
-            *scale = next.min(MAX_SCALE);
+            *scale = next;
         }
         changed
     }

@@ -56,7 +56,7 @@ const CHECK_EVERY_S: f64 = 4.0;
 /// many adjustments may hold up the exposures of one moment.
 const PAUSE_S: f64 = 0.02;
 /// A clock counts as worse than before when its camera reports a deviation this many times larger.
-/// With half of it one whose report wavers by a half is forgotten again and again.
+/// With half of it one whose report wavers by a half is forgotten once, by chance.
 const WORSE: f64 = 3.0;
 /// After this many windows in a row that fit only if everything learnt was wrong, it is taken to
 /// have been wrong. With one, a single window in which two targets were mixed up undoes all that
@@ -136,7 +136,7 @@ pub(crate) struct ClockEstimator {
     needed: bool,
     /// Windows in a row that contradicted everything learnt before.
     refused: u32,
-    /// How many times what is known of the clocks has changed.
+    /// How many times what is known of the clocks may have changed.
     changes: u64,
 }
 
@@ -159,7 +159,7 @@ impl ClockEstimator {
         }
     }
 
-    /// How many times what is known of the clocks has changed: times that were corrected by an
+    /// How many times what is known of the clocks may have changed: times that were corrected by an
     /// earlier estimate are to be corrected anew.
     pub(crate) fn changes(&self) -> u64 {
         self.changes
@@ -300,7 +300,7 @@ impl ClockEstimator {
     /// to another time.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         self.belief.step_time(step_s);
-        (self.provisional, self.round) = (None, None);
+        self.forget_provisional();
         self.windows.clear();
         for time in [&mut self.now, &mut self.next_look, &mut self.next_adjustment] {
             *time = time.plus_seconds(step_s);
@@ -352,8 +352,8 @@ impl ClockEstimator {
     /// counts as badly known as it was at the start, until a window determines it.
     pub(crate) fn suspect(&mut self, camera: &CameraName) {
         if self.belief.is_uncertain(camera) {
-            self.changes += 1;
             if let Some(reported) = self.reported.get_mut(camera) {
+                self.changes += u64::from(!reported.suspected || reported.cleared);
                 (reported.suspected, reported.cleared) = (true, false);
             }
             self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));

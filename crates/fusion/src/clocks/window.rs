@@ -4,6 +4,7 @@ use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Vector3};
 
+use crate::cameras::LASTING_S;
 use crate::track::TrackId;
 use crate::uncertainty::CorrelatedNoise;
 
@@ -151,30 +152,43 @@ impl TrackWindow {
         })
     }
 
-    /// For how long a camera's bearings are of times at which another sees the target, s, where its
-    /// clock (by index in the window) is ahead by so much.
+    /// The longest time for which a camera and another see the target together, s, where the clock
+    /// of each (by index in the window) is ahead by so much.
     pub(super) fn together_s(&self, camera: usize, ahead_s: impl Fn(usize) -> f64) -> f64 {
-        let mut own = (f64::INFINITY, f64::NEG_INFINITY);
-        let mut others = own;
-        for sight in &self.sights {
-            let time_s = sight.time_s - ahead_s(sight.camera);
-            let (first, last) = if sight.camera == camera { &mut own } else { &mut others };
-            (*first, *last) = (first.min(time_s), last.max(time_s));
-        }
-        own.1.min(others.1) - own.0.max(others.0)
+        let spans: Vec<(f64, f64)> = (0..self.cameras.len())
+            .map(|index| {
+                let (first, last) = self.span_of(index);
+                (first - ahead_s(index), last - ahead_s(index))
+            })
+            .collect();
+        let (first, last) = spans[camera];
+        let others = spans.iter().enumerate().filter(|(index, _)| *index != camera);
+        others.map(|(_, other)| last.min(other.1) - first.max(other.0)).fold(0.0, f64::max)
+    }
+
+    /// Earliest and latest time of a camera's bearings, s; infinite, the later one first, if it has
+    /// none.
+    fn span_of(&self, camera: usize) -> (f64, f64) {
+        let own = self.sights.iter().filter(|sight| sight.camera == camera);
+        own.fold((f64::INFINITY, f64::NEG_INFINITY), |(first, last), sight| {
+            (first.min(sight.time_s), last.max(sight.time_s))
+        })
     }
 
     /// Factor by which a camera's bearings repeat one another whose residuals have `scale` times
-    /// the reported variance: what of that is neither reported nor shown to be white by differences
-    /// of successive bearings lasts.
+    /// the variance that is reckoned with: what of that is neither reported nor shown to be white
+    /// by differences of successive bearings lasts.
     pub(super) fn repetition(&self, camera: usize, scale: f64) -> f64 {
-        let own = self.sights.iter().filter(|sight| sight.camera == camera);
-        let times: Vec<f64> = own.map(|sight| sight.time_s).collect();
-        let span_s = times.last().zip(times.first()).map_or(0.0, |(last, first)| last - first);
-        let interval_s = span_s / times.len().max(1) as f64;
-        let lasting = CorrelatedNoise { sd_rad: 1.0, ..CorrelatedNoise::NONE };
-        let excess = (1.0 - self.white[camera].max(1.0) / scale).max(0.0);
-        1.0 - excess + excess * lasting.as_white(interval_s)
+        let own = || self.sights.iter().filter(|sight| sight.camera == camera);
+        let count = own().count() as f64;
+        let allowance = own().map(|sight| sight.allowance).sum::<f64>() / count;
+        let excess = 1.0 - (self.white[camera] / allowance).max(1.0) / scale;
+        if count < 2.0 || excess <= 0.0 {
+            return 1.0;
+        }
+        let (first, last) = self.span_of(camera);
+        let lasting = CorrelatedNoise { sd_rad: excess.sqrt(), time_s: LASTING_S };
+        1.0 - excess + lasting.as_white((last - first) / (count - 1.0))
     }
 
     /// Indices of the cameras that have given enough bearings to be checked.

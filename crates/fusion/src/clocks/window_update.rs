@@ -19,7 +19,7 @@ const LEAST_WINDOW_S: f64 = 1.0;
 const MAX_OUTLIERS: f64 = 0.3;
 /// Residuals larger than this, or clocks farther than this from their prior (both squared, over
 /// what was expected), may be due to a clock that has jumped. With half of the first every window
-/// is searched for jumps, in up to six fits more; with half of the second a jump that only the
+/// is searched for jumps, in up to fifteen fits more; with half of the second a jump that only the
 /// prior shows is looked for at 0.7 times the size.
 const SUSPICIOUS_SCALE: f64 = 1.5;
 const SUSPICIOUS_PULL: f64 = 6.0;
@@ -27,7 +27,7 @@ const SUSPICIOUS_PULL: f64 = 6.0;
 /// With half of it a jump would be accepted as if they did every twelve minutes.
 const JUMP: f64 = 18.0;
 /// Cameras that are tried for a jump, the least fitting first. With half of it a jump of the third
-/// is not found; each more costs a fit.
+/// is not found; each more costs three fits.
 const MAX_SUSPECTS: usize = 4;
 /// Bearings of a camera that fit better than all of its bearings by this factor (squared) are taken
 /// after a jump. With half of it they need not even fit as well, and any poor fit may pass for a
@@ -93,7 +93,8 @@ struct Jump {
     /// The belief before the window, with the clock in doubt.
     belief: Belief,
     adjusted: AdjustedCameras,
-    /// By how much more likely (twice the logarithm) the window is than without the jump, ...
+    /// By how much more likely (twice the logarithm) the window is than without the jump; infinite
+    /// if that explains too few bearings to be compared, ...
     gain: f64,
     /// ... and whether it fits without it.
     fitted: bool,
@@ -104,8 +105,9 @@ impl JumpTest<'_> {
         let plain = self.fit(&self.belief);
         let fitting = plain.as_ref().filter(|adjusted| fits(adjusted));
         let unmoved = fitting.map(|adjusted| self.learnt(self.belief.clone(), adjusted));
-        if let (Some(belief), false) = (&unmoved, fitting.is_some_and(is_suspicious)) {
-            return WindowUpdate::Accepted(Box::new(belief.clone()));
+        let is_strange = fitting.is_none_or(is_suspicious);
+        if let Some(belief) = unmoved.clone().filter(|_| !is_strange) {
+            return WindowUpdate::Accepted(Box::new(belief));
         }
         // Try a jump within the window first, then for each suspect a jump before it, at a price.
         let suspects = self.suspects(plain.as_ref());
@@ -126,7 +128,7 @@ impl JumpTest<'_> {
         if let (_, Some(belief)) = best {
             return WindowUpdate::Accepted(Box::new(belief));
         }
-        // Nothing fits: try without anything learnt before.
+        // Nothing fits: try without anything learnt of clocks and poses before.
         self.belief.reset_all();
         self.components = components(&self.belief, self.window);
         let anew = self.fit(&self.belief).filter(fits);
@@ -195,13 +197,16 @@ impl JumpTest<'_> {
         }
         let (first, last) = self.window.span()?;
         let later = self.window.without_early((first + last) / 2.0, camera);
+        if !later.checked_cameras().contains(camera) {
+            return None;
+        }
         let jump = self.jump(camera, &later, plain)?;
         // Both must hold: the later half fits better without the earlier one, and it does not fit
         // as well with the clock as it was.
         let much_better =
             plain.is_none_or(|plain| strange(&jump.adjusted) * BETTER < strange(plain));
         // Where nothing was known of the clock yet, the evidences are even: nothing favours the old
-        // clock. Where the old one does not fit at all, the new one must explain more.
+        // clock. Where the old one fits badly, the new one must explain more.
         let jumped = jump.gain > if jump.fitted { -EVEN } else { JUMP };
         let learnt = self.learnt(jump.belief, &jump.adjusted);
         (much_better && jumped && self.shows_jump(camera, &later, &learnt)).then_some(learnt)

@@ -84,6 +84,11 @@ impl<Note> ReorderQueue<Note> {
         Some((exposure, note))
     }
 
+    /// All that wait, in order.
+    pub(crate) fn drained(self) -> impl Iterator<Item = (Exposure, Note)> {
+        self.waiting.into_values()
+    }
+
     /// Number of exposures that wait, and of their sightings.
     #[cfg(test)]
     pub(super) fn load(&self) -> (usize, usize) {

@@ -25,7 +25,7 @@ impl Fusion {
         while let Some(next) = self.buffer.pop() {
             self.handle(next, outputs);
         }
-        while let Some((exposure, _)) = self.corrected.pop() {
+        while let Some(exposure) = self.next_corrected(None, outputs) {
             self.process(&exposure, outputs);
         }
     }
