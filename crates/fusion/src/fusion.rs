@@ -332,7 +332,8 @@ impl Fusion {
             // left out.
             let is_fixed = |sample: &ScaleSample| !self.cameras.is_on_mount(&sample.camera);
             let samples: Vec<ScaleSample> = samples.into_iter().filter(is_fixed).collect();
-            if samples.len() < if age_s < PAIR_BELIEVED_AFTER_S { 3 } else { 2 } {
+            let least = if age_s < PAIR_BELIEVED_AFTER_S { 3 } else { 2 };
+            if samples.len() < least {
                 continue;
             }
             self.cameras.watch(&samples, exposure.time);

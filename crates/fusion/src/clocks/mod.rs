@@ -22,7 +22,7 @@ use crossfix_message::{CameraName, ClockSource, Timestamp};
 use nalgebra::Matrix6;
 
 use self::belief::Belief;
-use self::window::{Role, TrackWindow};
+use self::window::{Role, StampedLine, TrackWindow};
 use self::window_update::{WindowUpdate, window_update};
 use crate::config::Clocks;
 use crate::ingress::Exposure;
@@ -326,8 +326,9 @@ impl ClockEstimator {
         let is_new = !self.windows[index].cameras.contains(camera);
         let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
         let window = &mut self.windows[index];
-        let line = (*line, exposure.uncertainty.declared_lasting, exposure.uncertainty.factor);
-        window.add(camera, role, time, line, track.position_at(exposure.time).coords);
+        let CameraUncertainty { declared_lasting, factor, .. } = exposure.uncertainty;
+        let line = StampedLine { time, line: *line, lasting: declared_lasting, white: factor };
+        window.add(camera, role, line, track.position_at(exposure.time).coords);
     }
 
     /// Largest relative deviation of any camera's clock, s.

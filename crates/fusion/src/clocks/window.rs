@@ -43,6 +43,18 @@ pub(super) struct WindowBearing {
     pub(super) place: Vector3<f64>,
 }
 
+/// A line of sight as it comes to a window.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct StampedLine {
+    /// By the camera's own clock.
+    pub(super) time: Timestamp,
+    pub(super) line: SightLine,
+    /// The part of its errors that is declared to last.
+    pub(super) lasting: CorrelatedNoise,
+    /// Factor on its reported variance that differences of successive bearings show to be white.
+    pub(super) white: f64,
+}
+
 /// Role of a camera in a window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Role {
@@ -84,15 +96,12 @@ impl TrackWindow {
         }
     }
 
-    /// Takes in a bearing, stamped by the camera's own clock, with the part of its errors that is
-    /// declared to last, the factor on its variance that is white noise, and where the track has
-    /// the target.
+    /// Takes in a bearing, with where the track has the target.
     pub(super) fn add(
         &mut self,
         camera: &CameraName,
         role: Role,
-        time: Timestamp,
-        (mut line, lasting, white): (SightLine, CorrelatedNoise, f64),
+        StampedLine { time, mut line, lasting, white }: StampedLine,
         place: Vector3<f64>,
     ) {
         let time_s = time.seconds_since(self.start);
@@ -244,8 +253,7 @@ mod tests {
             window.add(
                 &camera,
                 Role::Wanted,
-                time,
-                (line, CorrelatedNoise::NONE, 1.0),
+                StampedLine { time, line, lasting: CorrelatedNoise::NONE, white: 1.0 },
                 Vector3::zeros(),
             );
         }
@@ -271,8 +279,12 @@ mod tests {
             window.add(
                 &camera,
                 role,
-                Timestamp::from_seconds(f64::from(k) / 60.0),
-                (line, CorrelatedNoise::NONE, 1.0),
+                StampedLine {
+                    time: Timestamp::from_seconds(f64::from(k) / 60.0),
+                    line,
+                    lasting: CorrelatedNoise::NONE,
+                    white: 1.0,
+                },
                 Vector3::zeros(),
             );
         }

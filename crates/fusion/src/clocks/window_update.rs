@@ -230,7 +230,7 @@ impl JumpTest<'_> {
         belief.doubt_jumped(camera);
         let mut shown: Vec<&AdjustedCameras> = plain.into_iter().collect();
         let first = self.fit_once(&belief, window, &shown).filter(fits)?;
-        // With all that it shows counted as lasting, a jump is no better known: two fits are saved.
+        // What counts as lasting only makes a jump less sure: one that does not show yet never will.
         if !self.shows_jump(camera, window, &self.learnt(belief.clone(), &first)) {
             return None;
         }

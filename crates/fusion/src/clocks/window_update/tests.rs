@@ -2,7 +2,7 @@ use crossfix_geometry::{SightLine, tangent_basis};
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix2, Point3, Unit, Vector2, Vector3};
 
-use super::super::window::Role;
+use super::super::window::{Role, StampedLine};
 use super::*;
 use crate::track::TrackId;
 use crate::uncertainty::CorrelatedNoise;
@@ -45,7 +45,12 @@ fn after(
         let line = SightLine { origin, direction, basis, covariance };
         let stamped = Timestamp::EPOCH.plus_seconds(t + if is_b { ahead_s } else { 0.0 });
         let place = Vector3::from(place(t).coords);
-        window.add(&name(camera), Role::Wanted, stamped, (line, CorrelatedNoise::NONE, 1.0), place);
+        window.add(
+            &name(camera),
+            Role::Wanted,
+            StampedLine { time: stamped, line, lasting: CorrelatedNoise::NONE, white: 1.0 },
+            place,
+        );
     }
     match window_update(&belief, &window) {
         WindowUpdate::Accepted(belief) => {
