@@ -263,7 +263,7 @@ impl Track {
     /// The track's state now and for the seconds ahead, for cueing.
     pub(crate) fn known(&self, now: Timestamp, motion: &MotionSetup) -> CueTarget {
         let of = Cued { track_id: self.id.0, ..Default::default() };
-        let seen_from = self.follower.filter(|_| !self.held);
+        let seen_from = self.alone();
         CueTarget::new(of, now, seen_from, |time| self.predicted(time, motion))
     }
 
@@ -293,12 +293,17 @@ impl Track {
             && self.position_sd() > MAX_PAIR_SHARE * self.range()
     }
 
-    /// Whether the track is only a direction: one camera alone has lately followed the target, and
-    /// the range is unknown.
+    /// Whether the track is only a direction: one camera alone sees the target, and the range is
+    /// unknown.
     pub(crate) fn is_a_direction(&self, time: Timestamp, motion: &MotionSetup) -> bool {
         let vague =
             |origin| log_range_sd(&self.predicted(time, motion), origin) > VAGUE_LOG_RANGE_SD;
-        !self.held && self.follower.is_some_and(vague)
+        self.alone().is_some_and(vague)
+    }
+
+    /// Position of the camera that alone sees the target now: the range from there is not observed.
+    fn alone(&self) -> Option<Point3<f64>> {
+        self.follower.filter(|_| !self.ranged)
     }
 
     /// Probability that the target is visible to a camera at a time, given what that camera has
@@ -359,8 +364,9 @@ impl Track {
             self.settle_past();
             self.keep_ties_possible();
         }
-        // The iterated update works in range coordinates about the camera that follows alone.
-        let seen_from = self.follower.filter(|_| !self.held);
+        // Where one camera alone sees the target, the iterated update works in range coordinates
+        // about it.
+        let seen_from = self.alone();
         let known = self.errors_of(camera, interval);
         let bearing = (line, &known);
         // A lasting error may have been drawn again since (a label that jumps): take the likelier

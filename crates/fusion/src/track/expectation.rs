@@ -65,7 +65,7 @@ impl Track {
         let errors = self.errors_of(camera, interval);
         // For the following camera itself the uncertain range moves no bearing: it has one
         // direction.
-        let follower = self.follower.filter(|follower| !self.held && *follower != origin);
+        let follower = self.alone().filter(|follower| *follower != origin);
         if let Some(seen_from) = follower {
             let state = self.predicted(time, motion);
             if log_range_sd(&state, seen_from) > VAGUE_LOG_RANGE_SD {
