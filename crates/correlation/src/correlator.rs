@@ -323,7 +323,7 @@ impl Correlator {
         let transform = self.transforms.of(size);
         transform.forward(&self.centred, &mut self.gate_spectrum);
         self.gate_spectrum.multiply_conjugate(&self.kernel_spectrum);
-        // Inverse transform of q H G* is the similarity map (eq. 3.7).
+        // Inverse transform of q H G* is the similarity map (Lytvynets 2020, eq. 3.7).
         weigh(&mut self.gate_spectrum, size, weight);
         let (width, height) = match extent {
             Extent::Circular => (size.width, size.height),
