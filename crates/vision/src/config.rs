@@ -46,7 +46,7 @@ pub struct TrackerConfig {
     /// Inverse of the share of the reference's energy that a mismatch with the target may take.
     /// Default 30; at 60 textured background is taken for targets.
     pub mismatch: f64,
-    /// Standard deviation of the contrast from frame to frame, as a share of it. Default 0.5.
+    /// Standard deviation of an image's contrast about what is expected, as a share of it. Default 0.5.
     pub contrast_sd: f64,
     /// Share of the images in which a target can be seen, apart from a blur or a bird in front of
     /// it. Default 0.95.
@@ -200,7 +200,7 @@ impl Default for DetectorConfig {
 /// A number of the configuration that is outside its range.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[error("`{key}` is {value}: it must be {must}")]
-pub struct ConfigError {
+pub struct TrackerConfigError {
     /// The key.
     pub key: &'static str,
     /// Its value.
@@ -209,15 +209,43 @@ pub struct ConfigError {
     pub must: &'static str,
 }
 
+fn check(
+    key: &'static str,
+    value: f64,
+    good: bool,
+    must: &'static str,
+) -> Result<(), TrackerConfigError> {
+    if good { Ok(()) } else { Err(TrackerConfigError { key, value, must }) }
+}
+
+impl DetectorConfig {
+    fn validate(&self) -> Result<(), TrackerConfigError> {
+        let rate = self.false_tracks_a_minute;
+        check(
+            "detector.false_tracks_a_minute",
+            rate,
+            (1e-6..=1e6).contains(&rate),
+            "from 0.000001 to 1000000",
+        )?;
+        let most = self.max_targets;
+        check("detector.max_targets", most as f64, (1..=1000).contains(&most), "from 1 to 1000")?;
+        let memory = self.background_s;
+        check(
+            "detector.background_s",
+            memory,
+            (0.1..=1e4).contains(&memory),
+            "from 0.1 to 10000 s",
+        )?;
+        Ok(())
+    }
+}
+
 impl TrackerConfig {
     /// Checks every number against its range.
     ///
     /// # Errors
-    /// The first [`ConfigError`].
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        let check = |key, value: f64, good: bool, must| {
-            if good { Ok(()) } else { Err(ConfigError { key, value, must }) }
-        };
+    /// The first [`TrackerConfigError`].
+    pub fn validate(&self) -> Result<(), TrackerConfigError> {
         let positive = [
             ("noise_floor", self.noise_floor),
             ("acceleration_sd_px", self.acceleration_sd_px),
@@ -249,6 +277,12 @@ impl TrackerConfig {
         )?;
         let margin = self.margin_px;
         check("margin_px", margin, (0.0..=100.0).contains(&margin), "from 0 to 100 px")?;
+        self.validate_paper()?;
+        self.validate_gate_and_reference()?;
+        self.detector.as_ref().map_or(Ok(()), DetectorConfig::validate)
+    }
+
+    fn validate_paper(&self) -> Result<(), TrackerConfigError> {
         if let Similarity::CrossSpectrum(SpectralWeight { whitening, band }) = self.paper.similarity
         {
             let good = (0.0..=1.0).contains(&whitening);
@@ -270,37 +304,10 @@ impl TrackerConfig {
             let must = "false where the extent is linear: a reference as large as the gate has one place in it";
             check("paper.whole_gate", 1.0, false, must)?;
         }
-        self.validate_gate_and_reference()?;
-        if let Some(detector) = &self.detector {
-            let rate = detector.false_tracks_a_minute;
-            check(
-                "detector.false_tracks_a_minute",
-                rate,
-                (1e-6..=1e6).contains(&rate),
-                "from 0.000001 to 1000000",
-            )?;
-            let most = detector.max_targets;
-            check(
-                "detector.max_targets",
-                most as f64,
-                (1..=1000).contains(&most),
-                "from 1 to 1000",
-            )?;
-            let memory = detector.background_s;
-            check(
-                "detector.background_s",
-                memory,
-                (0.1..=1e4).contains(&memory),
-                "from 0.1 to 10000 s",
-            )?;
-        }
         Ok(())
     }
 
-    fn validate_gate_and_reference(&self) -> Result<(), ConfigError> {
-        let check = |key, value: f64, good: bool, must| {
-            if good { Ok(()) } else { Err(ConfigError { key, value, must }) }
-        };
+    fn validate_gate_and_reference(&self) -> Result<(), TrackerConfigError> {
         let within = |value: f64| value > 0.0 && value < 1.0;
         match self.gate {
             GateRule::ThreeSided => {}
@@ -312,9 +319,13 @@ impl TrackerConfig {
             }
         }
         match self.reference {
-            ReferenceStrategy::Smoothing { memory: share }
-            | ReferenceStrategy::Mean { least_share: share } => {
-                check("reference", f64::from(share), (0.0..=1.0).contains(&share), "from 0 to 1")?;
+            ReferenceStrategy::Smoothing { memory } => {
+                let holds = (0.0..=1.0).contains(&memory);
+                check("reference.memory", f64::from(memory), holds, "from 0 to 1")?;
+            }
+            ReferenceStrategy::Mean { least_share } => {
+                let holds = (0.0..=1.0).contains(&least_share);
+                check("reference.least_share", f64::from(least_share), holds, "from 0 to 1")?;
             }
             ReferenceStrategy::PixelImm(imm) => {
                 let noises = [

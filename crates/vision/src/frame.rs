@@ -6,9 +6,6 @@ use nalgebra::Matrix2;
 use crate::scene::SceneMemory;
 use crate::{ImagePoint, TrackerConfig};
 
-/// The frame interval that shares per frame refer to, s.
-pub(crate) const FRAME_INTERVAL: f64 = 1.0 / 30.0;
-
 /// The next image, and what goes with it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FrameInput<'a> {

@@ -4,7 +4,7 @@
 use crate::ImagePoint;
 use crate::arrival::PlacedReference;
 use crate::fit::TargetFit;
-use crate::frame::{FRAME_INTERVAL, FrameInput};
+use crate::frame::FrameInput;
 use crate::motion::ImageMotion;
 use crate::scene::{SceneMemory, ScenePicture};
 use crate::scratch::Scratch;
@@ -39,6 +39,9 @@ const CLEAR: f64 = 0.9;
 /// With half of it a target that has become noise is doubted after four images instead of two, at
 /// 30 per second, where nothing else is known.
 const MOST: f64 = 2.0;
+/// Images that are closer together than this tell no more than one, s: blur and compression last
+/// from one to the next. With half of it sixty images a second tell twice as much as thirty.
+const NEWS_S: f64 = 1.0 / 30.0;
 /// Number of the scene's pictures in which a target remembers its place: more than there are. With
 /// half of it the same.
 const MOST_PICTURES: usize = 16;
@@ -203,7 +206,7 @@ impl Identity {
         scratch: &mut Scratch,
     ) -> f64 {
         // Images that follow each other sooner tell no more than one would.
-        let share = (frame.interval / FRAME_INTERVAL).min(1.0);
+        let share = (frame.interval / NEWS_S).min(1.0);
         let placements = scratch.ratios.samples().len() as f64;
         let above_noise = above_noise_log_ratio(state, fit.contrast, placements);
         let log_ratio =

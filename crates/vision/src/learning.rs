@@ -2,7 +2,7 @@
 
 use crate::ImagePoint;
 use crate::fit::TargetFit;
-use crate::frame::{FRAME_INTERVAL, FrameInput};
+use crate::frame::FrameInput;
 use crate::scratch::Scratch;
 use crate::state::{SEEN, TargetBelief};
 
@@ -21,11 +21,11 @@ const LEARNING_SCORES: [f64; 2] = [0.35, 0.70];
 /// weighed in. With half of them hardly anything changes: the certainty is the weight of what is
 /// learnt.
 const LEAST_CERTAINTY: [f64; 2] = [0.05, 0.02];
-/// Random walk of the contrast, as a share of it per frame of a thirtieth of a second, and the
-/// floor of its measurement's standard deviation. In little noise the gain is 0.73; with half of
-/// the first it is 0.5, and the contrast lags an image behind a cloud's edge; with half of the
-/// second it is 0.9, and follows every misfit.
-const CONTRAST_WALK: f64 = 0.14;
+/// Random walk of the contrast, as a share of it per root second, and the floor of its
+/// measurement's standard deviation. In little noise the gain is 0.73 at thirty images a second;
+/// with half of the first it is 0.5, and the contrast lags an image behind a cloud's edge; with
+/// half of the second it is 0.9, and follows every misfit.
+const CONTRAST_WALK: f64 = 0.767;
 const CONTRAST_FLOOR: f64 = 0.1;
 /// Floor of the standard deviation of a measured log scale or turn. With half of it the gain of the
 /// scale is 0.21 instead of 0.11, and the size follows every misfit.
@@ -61,8 +61,7 @@ impl TargetBelief {
                 / clear.powi(2)
                 + CONTRAST_FLOOR.powi(2);
             // Kalman filter of the contrast: P grows by the walk, gain = certainty P / (P + R).
-            self.contrast_variance +=
-                (CONTRAST_WALK * self.contrast).powi(2) * interval / FRAME_INTERVAL;
+            self.contrast_variance += (CONTRAST_WALK * self.contrast).powi(2) * interval;
             let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
             self.contrast = (self.contrast + gain * (measured - self.contrast)).clamp(0.2, 5.0);
             self.contrast_variance *= 1.0 - gain;

@@ -22,7 +22,7 @@
 //!     let error = tracks[0].position.x - (30.0 + 2.0 * f64::from(frame));
 //!     assert!(error.abs() < 0.6, "frame {frame}: {error}");
 //! }
-//! # Ok::<(), crossfix_vision::ConfigError>(())
+//! # Ok::<(), crossfix_vision::TrackerConfigError>(())
 //! ```
 
 mod appearance;
@@ -62,7 +62,9 @@ mod tracker;
 
 use std::fmt;
 
-pub use config::{Algorithm, ConfigError, DetectorConfig, GateRule, PaperConfig, TrackerConfig};
+pub use config::{
+    Algorithm, DetectorConfig, GateRule, PaperConfig, TrackerConfig, TrackerConfigError,
+};
 pub use frame::Measurement;
 pub use reference::{ImmConfig, PixelImm, ReferenceStrategy};
 pub use tracker::{ImageTrack, ImageTracker, TrackPhase};

@@ -34,15 +34,19 @@ const STILL_PX: f64 = 0.1;
 /// registered.
 const STILL_S: f64 = 0.1;
 
-/// The camera is jerked if the change from one image to the next exceeds the usual one by this
-/// factor, and by this many levels, ...
-const JERK: f32 = 1.5;
-const JERK_LEVELS: f32 = 0.25;
-/// ... where the usual change is a running mean, in which the last image has this share. With half
-/// of `JERK` every image is a jerk whose usual change exceeds a level, with half of `JERK_LEVELS`
-/// so is a flicker of an eighth of a level; with half of this share a wind that sets in is one for
-/// twice as many images.
-const USUAL_SHARE: f32 = 0.05;
+/// The change from one image to the next that shows that the camera is jerked.
+struct Jerk {
+    /// Factor above the usual change. With half of it every image is a jerk whose usual change
+    /// exceeds a level.
+    factor: f32,
+    /// Levels above that. With half of it so is a flicker of an eighth of a level.
+    levels: f32,
+    /// Time constant of the running mean that is the usual change, s. With half of it a jerk counts
+    /// twice as much in what is usual after it.
+    usual_s: f64,
+}
+
+const JERK: Jerk = Jerk { factor: 1.5, levels: 0.25, usual_s: 0.65 };
 
 /// A picture of the scene.
 #[derive(Clone, Debug, Default)]
@@ -99,7 +103,7 @@ struct RowGlance {
 
 impl RowGlance {
     /// Whether most of the image has changed since the image before, by more than noise.
-    fn is_another(&mut self, image: &Plane) -> bool {
+    fn is_another(&mut self, image: &Plane, interval: f64) -> bool {
         let Self { means, changes, usual } = self;
         let rows = (COARSENESS / 2..image.height()).step_by(COARSENESS);
         let blocks =
@@ -120,9 +124,10 @@ impl RowGlance {
         }
         // The median of the changes: targets change a few blocks, a jerk most of them.
         let change = median(changes);
-        let is_jerk = change > JERK * *usual + JERK_LEVELS;
+        let is_jerk = change > JERK.factor * *usual + JERK.levels;
         // A jerk enters the usual change only as far as the threshold.
-        *usual += USUAL_SHARE * (change.min(JERK * *usual + JERK_LEVELS) - *usual);
+        let share = (1.0 - (-interval / JERK.usual_s).exp()) as f32;
+        *usual += share * (change.min(JERK.factor * *usual + JERK.levels) - *usual);
         is_jerk
     }
 }
@@ -177,7 +182,7 @@ impl SceneMemory {
         for picture in &mut self.pictures {
             picture.age_s += interval;
         }
-        let is_jerked = self.glance.is_another(image);
+        let is_jerked = self.glance.is_another(image, interval);
         // Half an interval is added so that the image nearest to the time is used.
         let is_time = is_jerked || !self.is_still || self.unlooked_s + interval / 2.0 >= STILL_S;
         // A picture that will be kept needs its coarse version and its shift, whatever the camera

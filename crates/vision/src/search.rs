@@ -20,17 +20,24 @@ use crate::state::TargetBelief;
 /// in forty is lost for good, as something else is found and followed; with 0.999 an eighth more of
 /// the frames of small targets in noise are lost.
 const SURE_PLACE: f32 = 0.99;
-/// The best place of a single picture (and a find of the detector, by the first of these) is
-/// accepted if its log likelihood ratio, less the scene's own there, is at least `LEAST_RATIO` and
-/// at least `MARGIN` above that of the next best place, and if its contrast is by `ABOVE_CHANCE`
-/// nats likelier the target's than the best one's of all places searched. On the shared and drawn
-/// cases half of the places that such a search takes for the target are others' without the last
-/// condition, and with 4 a third; with twice as much an eighth of the right ones is refused. With
-/// half of the first two, 4.5 times likelier than background and 1.6 times likelier than the next
-/// place would do.
-pub(crate) const LEAST_RATIO: f32 = 3.0;
-const MARGIN: f32 = 1.0;
-const ABOVE_CHANCE: f64 = 4.0;
+/// What the best place of a single picture must show to be accepted; of a find of the detector,
+/// the first of these. On the shared and drawn cases half of the places that such a search takes
+/// for the target are others' without the last condition.
+pub(crate) struct ClearFind {
+    /// Its log likelihood ratio, less the scene's own there. With half of it 4.5 times likelier
+    /// than background would do.
+    pub(crate) least_ratio: f32,
+    /// By how much that is above the next best place's. With half of it 1.6 times likelier than
+    /// that would do.
+    least_margin: f32,
+    /// By how many nats its contrast is likelier the target's than the best one's of all places
+    /// searched. With half of it a third of the places are others'; with twice as much an eighth of
+    /// the right ones is refused.
+    above_chance: f64,
+}
+
+pub(crate) const CLEAR: ClearFind =
+    ClearFind { least_ratio: 3.0, least_margin: 1.0, above_chance: 4.0 };
 /// Variance of the noise in the picture of what has changed, over that in the image: the image's
 /// own noise, and what interpolation leaves of the older picture's. With half of it noise looks
 /// like the target by up to twice the log likelihood ratio.
@@ -103,11 +110,11 @@ impl Sought<'_> {
             let best = area.best_cell(&area.prior(self.state, frame.config), scratch);
             let scene = seen.and_then(|at| area.empty_scene(sides, turned, at, self.memory));
             let background = scene.map_or(0.0, |scene| scene.at(best.cell));
-            return self.clear_find(frame, searched, (&area, best, background), scratch);
+            return self.clear_find(frame, searched, &area, best, background, scratch);
         }
         let cell = [likeliest.column, likeliest.row];
         let (place, reach) = (area.place_of(cell), 2 * area.coarseness + 1);
-        let (_, fit) = self.at_full_resolution(frame, searched, (place, reach), scratch);
+        let (_, fit) = self.at_full_resolution(frame, searched, place, reach, scratch);
         let has_come = self.has_come(frame, &fit, scratch);
         if let Some(map) = self.memory.map.as_mut().filter(|_| !has_come) {
             // It belongs to the scene.
@@ -149,7 +156,7 @@ impl Sought<'_> {
         log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
         let searched = Searched { picture: change, noise, likeness: coarse.likeness(scratch) };
         let best = area.best_cell(&area.prior(state, config), scratch);
-        self.clear_find(frame, searched, (&area, best, 0.0), scratch)
+        self.clear_find(frame, searched, &area, best, 0.0, scratch)
     }
 
     /// The target at the best place of one picture, if that is clearly its place. `background` is
@@ -158,18 +165,20 @@ impl Sought<'_> {
         &mut self,
         frame: FrameInput<'_>,
         searched: Searched<'_>,
-        (area, best, background): (&SearchArea, BestCell, f32),
+        area: &SearchArea,
+        best: BestCell,
+        background: f32,
         scratch: &mut Scratch,
     ) -> Option<TargetFit> {
-        let at = (area.place_of(best.cell), area.coarseness + 1);
-        let (peak, fit) = self.at_full_resolution(frame, searched, at, scratch);
+        let (place, reach) = (area.place_of(best.cell), area.coarseness + 1);
+        let (peak, fit) = self.at_full_resolution(frame, searched, place, reach, scratch);
         let state = &*self.state;
         // A noisy reference finds the target fainter than it is, by the clear share.
         let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
         let likelier = searched.likeness.log_ratio(peak.contrast, usual, frame.config.contrast_sd);
-        let is_clear = peak.log_ratio - background > LEAST_RATIO
-            && best.margin > MARGIN
-            && likelier > ABOVE_CHANCE;
+        let is_clear = peak.log_ratio - background > CLEAR.least_ratio
+            && best.margin > CLEAR.least_margin
+            && likelier > CLEAR.above_chance;
         (is_clear && self.has_come(frame, &fit, scratch)).then_some(fit)
     }
 
@@ -179,7 +188,8 @@ impl Sought<'_> {
         &mut self,
         frame: FrameInput<'_>,
         searched: Searched<'_>,
-        (place, reach): ([f64; 2], usize),
+        place: [f64; 2],
+        reach: usize,
         scratch: &mut Scratch,
     ) -> (BestPlacement, TargetFit) {
         let (state, config) = (&mut *self.state, frame.config);

@@ -12,6 +12,7 @@ use crate::state::TargetBelief;
 use crate::{ImagePoint, TrackerConfig};
 
 /// The best placement on the coarse picture.
+#[derive(Clone, Copy)]
 pub(crate) struct BestCell {
     /// Its column and row.
     pub(crate) cell: [usize; 2],

@@ -10,26 +10,27 @@ use crossfix_filter::AxisMeasurement;
 use crate::appearance::Appearance;
 use crate::centring::Surroundings;
 use crate::crop::crop;
-use crate::frame::{FRAME_INTERVAL, FrameInput};
+use crate::frame::FrameInput;
 use crate::likelihood::Expectation;
 use crate::motion::ImageMotion;
 use crate::scratch::Scratch;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
-/// Frames without the target after which it is searched for. With one, each blurred image begins a
-/// search; with six a lost target runs on with its prediction for 0.1 s longer, at 30 images per
-/// second.
-const SEARCH_AFTER_FRAMES: u32 = 3;
-/// Weight of a frame's noise in the running estimate. With half of it the noise in front of another
-/// background is known after six images instead of three.
-const NOISE_SHARE: f32 = 0.3;
+/// Images without the target after which it is searched for: what noise hides is another in each
+/// image. With one, each blurred image begins a search; with six a lost target runs on with its
+/// prediction for 0.1 s longer, at thirty images a second. (A limit of 0.09 s, which is one image
+/// at ten a second, loses a fifth more frames there.)
+const SEARCH_AFTER_IMAGES: u32 = 3;
+/// Time constant of the running estimate of an image's noise, s. With half of it the noise in front
+/// of another background is known after 0.05 s, and a single image's counts half as much again.
+const NOISE_S: f64 = 0.0935;
 /// Certainty above which a target counts as seen. With half of it a target is measured where it is
 /// likelier not to be.
 pub(crate) const SEEN: f64 = 0.5;
-/// Random walk of the log scale and of the turn, standard deviations per frame of a thirtieth of a
-/// second, and their largest variances. With half of the first a size is followed within 17 images
-/// instead of 9; with half of the second the gain after a long loss is 0.95 instead of 0.97.
-const SHAPE_WALK: [f64; 2] = [0.006, 0.02];
+/// Random walk of the log scale and of the turn, standard deviations per root second, and their
+/// largest variances. With half of the first a size is followed within 0.6 s instead of 0.3; with
+/// half of the second the gain after a long loss is 0.95 instead of 0.97.
+const SHAPE_WALK: [f64; 2] = [0.0329, 0.1095];
 const MOST_SHAPE_VARIANCE: [f64; 2] = [0.09, 0.25];
 /// Variances of both of a reference that has just been cut out: it has the target's size and
 /// direction by definition, but for what keeps a variance from being zero.
@@ -50,9 +51,9 @@ pub(crate) struct TargetBelief {
     pub(crate) usual_contrast: f64,
     /// Variances of the log scale and of the turn.
     pub(crate) shape_variances: [f64; 2],
-    /// Number of images since it was last seen, ...
+    /// Number of images without it since it was last seen, ...
     pub(crate) missed: u32,
-    /// ... and the time, s.
+    /// ... and the time since then, s.
     pub(crate) unseen_s: f64,
     pub(crate) last_seen: ImagePoint,
     /// Whether it has not been seen yet but where it was given.
@@ -114,7 +115,7 @@ impl TargetBelief {
 
     /// Whether it is searched for.
     pub(crate) fn is_searching(&self) -> bool {
-        self.missed >= SEARCH_AFTER_FRAMES
+        self.missed >= SEARCH_AFTER_IMAGES
     }
 
     /// Notes that it was seen at a place.
@@ -128,16 +129,17 @@ impl TargetBelief {
     pub(crate) fn predict(&mut self, frame: FrameInput<'_>) {
         self.motion.predict(frame.interval, frame.sides());
         self.unseen_s += frame.interval;
-        let frames = frame.interval / FRAME_INTERVAL;
         for (i, variance) in self.shape_variances.iter_mut().enumerate() {
-            *variance = (*variance + SHAPE_WALK[i].powi(2) * frames).min(MOST_SHAPE_VARIANCE[i]);
+            *variance =
+                (*variance + SHAPE_WALK[i].powi(2) * frame.interval).min(MOST_SHAPE_VARIANCE[i]);
         }
     }
 
     /// Takes the noise of an image into the running estimate.
-    pub(crate) fn note_noise(&mut self, noise: f32) {
-        self.noise =
-            if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
+    pub(crate) fn note_noise(&mut self, noise: f32, interval: f64) {
+        // A low pass with this time constant, and the first image as it is.
+        let share = if self.is_new { 1.0 } else { (1.0 - (-interval / NOISE_S).exp()) as f32 };
+        self.noise += share * (noise - self.noise);
     }
 
     /// What the likelihood expects of the target in the image.

@@ -8,7 +8,7 @@ use crate::followed::{Followed, Follower, Origin, describe};
 use crate::frame::{FrameInput, Measurement};
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
-use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
+use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig, TrackerConfigError};
 
 /// Bounds of the time between images, s; other intervals are clamped to them: after a longer pause
 /// nothing is known of a target anyway, and no camera is faster. With half of the first a camera of
@@ -124,8 +124,8 @@ impl ImageTracker {
     /// A tracker that follows nothing yet.
     ///
     /// # Errors
-    /// [`ConfigError`] if a number of the configuration makes no sense.
-    pub fn new(config: TrackerConfig) -> Result<Self, ConfigError> {
+    /// [`TrackerConfigError`] if a number of the configuration makes no sense.
+    pub fn new(config: TrackerConfig) -> Result<Self, TrackerConfigError> {
         config.validate()?;
         let detector = config.detector.clone().map(Detector::new);
         Ok(Self {

@@ -160,13 +160,7 @@ impl Candidate {
     }
 
     /// Updates with a plot; `chance` is the density of clutter, 1/px^2.
-    fn take(
-        &mut self,
-        plot: Plot,
-        place: [f64; 2],
-        (distance, determinant): (f64, f64),
-        chance: f64,
-    ) {
+    fn take(&mut self, plot: Plot, place: [f64; 2], distance: f64, determinant: f64, chance: f64) {
         for (axis, position) in self.axes.iter_mut().zip(place) {
             axis.measurement_update(AxisMeasurement { position, variance: plot.variance() });
         }
@@ -277,13 +271,14 @@ impl Candidates {
                 near.map(|(index, plot)| (index, candidate.distance(plot, in_scene(plot))));
             let held = distances.filter(|(_, (distance, _))| gate.holds(*distance));
             match held.min_by(|(_, (one, _)), (_, (other, _))| one.total_cmp(other)) {
-                Some((index, distance)) => {
+                Some((index, (distance, determinant))) => {
                     is_free[index] = false;
                     let plot = plots[index];
                     candidate.take(
                         plot,
                         in_scene(&plot),
                         distance,
+                        determinant,
                         self.clutter.density(plot.place),
                     );
                 }

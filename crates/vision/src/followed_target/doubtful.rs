@@ -49,8 +49,10 @@ impl Target {
         scratch: &mut Scratch,
     ) -> TargetStep {
         self.hypotheses.begin(&self.state);
-        if let Some(one) = self.hypotheses.one_place(&self.state, frame, region, scratch) {
-            return self.settle_on(one, frame, region, scratch);
+        if let Some((motion, posterior)) =
+            self.hypotheses.one_place(&self.state, frame, region, scratch)
+        {
+            return self.settle_on(motion, &posterior, frame, region, scratch);
         }
         self.hypotheses.advance(&self.state, frame, region, scratch);
         let Some(best) = self.hypotheses.best().cloned() else {
@@ -97,7 +99,8 @@ impl Target {
     /// was.
     fn settle_on(
         &mut self,
-        (motion, posterior): (ImageMotion, Posterior),
+        motion: ImageMotion,
+        posterior: &Posterior,
         frame: FrameInput<'_>,
         region: Region,
         scratch: &mut Scratch,
@@ -106,6 +109,6 @@ impl Target {
         self.hypotheses.clear();
         let [column, row] = posterior.peak;
         let fit = self.state.fit_at(column, row, region.origin, scratch, frame.config);
-        self.update(frame, &posterior, fit, region.origin, scratch)
+        self.update(frame, posterior, fit, region.origin, scratch)
     }
 }

@@ -194,7 +194,7 @@ impl Target {
             whole.sides,
             config.noise_floor as f32,
         );
-        self.state.note_noise(noise);
+        self.state.note_noise(noise, frame.interval);
 
         // The whole gate is looked at only if the middle of it leaves a doubt.
         let middle = if self.hypotheses.is_empty() {
