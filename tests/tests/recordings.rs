@@ -339,13 +339,23 @@ fn a_range_without_data_is_an_error() {
     let replay = |options: &[&str], code: i32| {
         stderr(&[&["replay", &source, "--fuse", "-o", &tracks], options].concat(), code)
     };
-    assert!(replay(&["--from", "3", "--to", "2"], 1).contains("is not before"));
+    assert!(replay(&["--from", "3", "--to", "2"], 2).contains("is not before"));
     assert!(replay(&["--from", "1000"], 1).contains("behind the end"));
     for bad in ["nan", "-1", "1e400"] {
         assert!(replay(&["--from", bad], 2).contains("invalid value"), "{bad}");
     }
-    let speed = ["replay", &source, "--network", &site.path("network.toml"), "--speed", "-1"];
-    assert!(stderr(&speed, 2).contains("it must be from 0 to 1000"));
+    let onto = |network: &str, speed: &str, code: i32| {
+        stderr(&["replay", &source, "--network", network, "--speed", speed], code)
+    };
+    for bad in ["-1", "1e-300"] {
+        assert!(onto(&site.path("network.toml"), bad, 2).contains("0, or from 0.01 to 1000"));
+    }
+    // A network of other cameras.
+    let foreign = site.path("foreign.toml");
+    let cameras = "fusion = \"tcp/127.0.0.1:3\"\n[cameras]\nfar = \"tcp/127.0.0.1:1\"\nfarther = \"tcp/127.0.0.1:2\"\n";
+    std::fs::write(&foreign, format!("site = \"elsewhere\"\nunsecured = true\n{cameras}")).unwrap();
+    let said = onto(&foreign, "0", 1);
+    assert!(said.contains("the network of site `elsewhere` lacks cameras of"), "{said}");
 }
 
 #[test]

@@ -161,7 +161,7 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
         .filter(|((_, sights), _)| !sights.is_empty())
         .map(|((pair, sights), later_s)| {
             let later_s = later_s.map(|own| own - common_s.unwrap_or(0.0));
-            camera(*pair, sights, &moved, later_s)
+            camera(pair.0, pair.1, sights, &moved, later_s)
         })
         .collect();
     let names = |site: &SiteCalibration, other: &SiteCalibration| -> Vec<CameraName> {
@@ -234,7 +234,8 @@ fn later_s(one: &CalibratedCamera, other: &CalibratedCamera) -> Option<f64> {
 }
 
 fn camera(
-    (one, other): (&CalibratedCamera, &CalibratedCamera),
+    one: &CalibratedCamera,
+    other: &CalibratedCamera,
     sights: &[ComparedPixel],
     moved: &SiteMove,
     later_s: Option<f64>,

@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-use crossfix_fusion::{CameraReport, CameraStanding, ConfigError, Fusion, FusionConfig, Output};
+use crossfix_fusion::{CameraReport, CameraTrust, Fusion, FusionConfig, FusionConfigError, Output};
 use crossfix_message::{
     BearingFrame, CameraCalibration, CameraHealth, CameraName, Channel, Counter, DecodeError,
     Health, Payload, Timestamp, decode,
@@ -85,7 +85,7 @@ impl Centre {
     pub fn new(
         config: FusionConfig,
         cameras: Option<Vec<CameraName>>,
-    ) -> Result<Self, ConfigError> {
+    ) -> Result<Self, FusionConfigError> {
         Ok(Self {
             fusion: Fusion::new(config)?,
             cameras,
@@ -250,7 +250,7 @@ impl Centre {
     /// The cameras that the fusion leaves out.
     pub fn left_out(&self) -> Vec<CameraName> {
         let reports = self.fusion.cameras();
-        let left_out = reports.filter(|report| report.standing == CameraStanding::Excluded);
+        let left_out = reports.filter(|report| report.standing == CameraTrust::Excluded);
         left_out.map(|report| report.camera).collect()
     }
 
@@ -267,6 +267,11 @@ impl Centre {
     /// Number of track frames so far.
     pub fn frames(&self) -> u64 {
         self.frames
+    }
+
+    /// Why no target is found although two cameras see something at the same time.
+    pub fn why_nothing(&self) -> Option<String> {
+        self.fusion.why_nothing().map(ToString::to_string)
     }
 
     /// Current data time; the epoch before there are any data.
@@ -293,7 +298,7 @@ impl Centre {
         let left_out = self.left_out();
         let left_out = left_out.iter().map(|camera| format!("camera `{camera}` is left out"));
         let moved = self.poses.problems().map(|(_, problem)| problem);
-        let nothing = self.fusion.why_nothing().map(|why| format!("nothing is found: {why}"));
+        let nothing = self.why_nothing().map(|why| format!("nothing is found: {why}"));
         Health {
             component: "fusion".to_owned(),
             time_ns: self.now().nanos(),
@@ -309,8 +314,8 @@ impl Centre {
 }
 
 /// Logs that a camera is left out, or used again.
-fn report_camera(camera: &CameraName, standing: CameraStanding) {
-    if standing == CameraStanding::Excluded {
+fn report_camera(camera: &CameraName, standing: CameraTrust) {
+    if standing == CameraTrust::Excluded {
         tracing::warn!(
             "camera `{camera}` is left out: its bearings do not fit the tracks that the others hold; check its pose and its clock"
         );
@@ -322,9 +327,9 @@ fn report_camera(camera: &CameraName, standing: CameraStanding) {
 /// A camera's report as a wire message.
 fn camera_health(report: &CameraReport) -> CameraHealth {
     let standing = match report.standing {
-        CameraStanding::Good => crossfix_message::CameraStanding::Good,
-        CameraStanding::Doubted => crossfix_message::CameraStanding::Doubted,
-        CameraStanding::Excluded => crossfix_message::CameraStanding::Excluded,
+        CameraTrust::Good => crossfix_message::CameraStanding::Good,
+        CameraTrust::Doubted => crossfix_message::CameraStanding::Doubted,
+        CameraTrust::Excluded => crossfix_message::CameraStanding::Excluded,
     };
     let clock = report.clock;
     CameraHealth {

@@ -63,14 +63,14 @@ struct Cli {
 
 fn main() -> ExitCode {
     network::give_zenoh_threads();
-    // clap handles wrong arguments itself, with exit code 2.
+    // clap handles wrong arguments itself, with exit code 2, and so does what it cannot see.
     let cli = Cli::parse();
     logging::start(&cli.logging);
     match shutdown::supervise(move || cli.command.run()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             output::error(&error);
-            ExitCode::FAILURE
+            if error.is::<output::Misuse>() { ExitCode::from(2) } else { ExitCode::FAILURE }
         }
     }
 }

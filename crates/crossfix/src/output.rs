@@ -17,6 +17,11 @@ pub fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Arguments that contradict each other, which the parser of the command line cannot see.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Misuse(pub String);
+
 /// Prints why the command failed: the error and its causes, a line each.
 pub fn error(error: &anyhow::Error) {
     let mut stderr = io::stderr().lock();

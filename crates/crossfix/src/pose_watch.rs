@@ -114,15 +114,15 @@ impl PoseWatch {
         self.cameras.iter().filter_map(move |(name, camera)| {
             let now = moved(camera)?;
             let what = "has been moved since it was calibrated";
-            Some((name, format!("camera `{name}` {what}: {}", Turn(&now))))
+            Some((name, format!("camera `{name}` {what}: {}", TurnText(&now))))
         })
     }
 }
 
 /// Text of how far a camera has been turned.
-pub struct Turn<'a>(pub &'a PoseFinding);
+pub struct TurnText<'a>(pub &'a PoseFinding);
 
-impl fmt::Display for Turn<'_> {
+impl fmt::Display for TurnText<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let PoseFinding { turn, turn_sd, or_else, .. } = self.0;
         write!(f, "turned by {:.1} mrad (± {:.1})", 1e3 * turn.norm(), 1e3 * turn_sd)?;

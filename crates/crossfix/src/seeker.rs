@@ -314,8 +314,10 @@ impl Seeker {
         let (long_axis, long_sd) = long_axis(now);
         if long_sd * SEARCHED_SDS > self.half_view {
             // A view of the search begins once the head stands there.
-            let stripe = Some((long_axis, long_sd)).filter(|_| is_settled);
-            return stripe.and_then(|stripe| self.search(mount, angles, now, stripe, time));
+            if !is_settled {
+                return None;
+            }
+            return self.search(mount, angles, now, long_axis, long_sd, time);
         }
         self.search = None;
         let soon = place_at(cue, time.plus_seconds(0.5))?;
@@ -351,7 +353,8 @@ impl Seeker {
         mount: &PanTilt,
         angles: ScanAngles,
         now: &PredictedDirection,
-        (axis, long_sd): (Vector3<f64>, f64),
+        axis: Vector3<f64>,
+        long_sd: f64,
         time: Timestamp,
     ) -> Option<ScanAngles> {
         // A recognised target is stared at: with a second camera its position will soon be known.

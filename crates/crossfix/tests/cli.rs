@@ -4,7 +4,7 @@
 
 use assert_cmd::Command;
 
-const COMMANDS: [&str; 15] = [
+const COMMANDS: [&str; 23] = [
     "demo",
     "agent",
     "track",
@@ -20,6 +20,14 @@ const COMMANDS: [&str; 15] = [
     "check",
     "plan",
     "calibrate",
+    "sources",
+    "recover",
+    "doctor",
+    "status",
+    "router",
+    "validate",
+    "enroll",
+    "outlet",
 ];
 
 fn crossfix() -> Command {
@@ -42,6 +50,31 @@ fn every_command_has_a_purpose_and_an_example() {
 fn misuse_ends_with_2_and_failure_with_1() {
     crossfix().arg("fly").assert().code(2);
     crossfix().args(["info", "no-such-file.mcap"]).assert().code(1);
+}
+
+#[test]
+fn numbers_that_nobody_can_mean_are_misuse() {
+    let of = [
+        (&["evaluate", "a.mcap", "--cutoff-m"][..], ["nan", "-1", "0", "1e300"]),
+        (&["evaluate", "a.mcap", "--skip-s"], ["nan", "-5", "inf", "1e300"]),
+        (&["evaluate", "a.mcap", "--truth-sd"], ["nan", "-1", "inf", "1e300"]),
+        (&["plan", "site", "--speed"], ["nan", "inf", "fast", "1e300"]),
+        (&["plan", "site", "--step"], ["nan", "0", "inf", "1e9"]),
+        (&["plan", "site", "--pixel-sd"], ["nan", "0", "inf", "1e300"]),
+        (&["export", "a.mcap", "--geoid"], ["nan", "inf", "high", "1e300"]),
+        (&["record", "-c", "a.toml", "-o", "a.mcap", "--rotate-mb"], ["nan", "0", "inf", "1e-9"]),
+        (&["demo", "--duration"], ["nan", "-1", "4", "1e300"]),
+        (&["simulate", "a.toml", "-o", "a.mcap", "--noise-px"], ["nan", "-1", "0", "1e300"]),
+        (&["sources", "--seconds"], ["nan", "inf", "long", "1e300"]),
+    ];
+    for (arguments, bad) in of {
+        for number in bad {
+            let output = crossfix().args(arguments).arg(number).output().unwrap();
+            let said = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert_eq!(output.status.code(), Some(2), "{arguments:?} {number}: {said}");
+            assert!(said.contains("invalid value"), "{arguments:?} {number}: {said}");
+        }
+    }
 }
 
 #[test]

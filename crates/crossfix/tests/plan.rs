@@ -125,9 +125,9 @@ fn what_cannot_be_planned_is_said_in_a_line() {
         assert_eq!(output.status.code(), Some(code), "{stderr}");
         assert!(stderr.contains(words), "no `{words}` in:\n{stderr}");
     };
-    says(&[SITE, "--min", "0,0,0", "--max", "10,-10,10"], 1, "is empty");
-    says(&[SITE, "--min", "0,0,0", "--max", "9000,9000,9000", "--step", "1"], 1, "larger step");
+    says(&[SITE, "--min", "0,0,0", "--max", "10,-10,10"], 2, "is empty");
+    says(&[SITE, "--min", "0,0,0", "--max", "9000,9000,9000", "--step", "1"], 2, "larger step");
     says(&[SITE, "--min", "0,0,0"], 2, "--max");
-    says(&[SITE, "--pixel-sd", "0"], 2, "more than 0");
+    says(&[SITE, "--pixel-sd", "0"], 2, "it must be from 0.01 to 1000 px");
     says(&[concat!(env!("CARGO_MANIFEST_DIR"), "/src")], 1, "holds no camera file");
 }

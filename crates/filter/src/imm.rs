@@ -164,7 +164,8 @@ impl Imm {
         &mut self,
         interval: f64,
         along: &Unit<Vector3<f64>>,
-        (before, since): (&MotionModels, &MotionModels),
+        before: &MotionModels,
+        since: &MotionModels,
     ) {
         let transitions = since.transitions(interval, &self.restlessness);
         let states: Vec<KinematicState> =

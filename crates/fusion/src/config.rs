@@ -311,7 +311,7 @@ impl Default for Tracking {
 /// A number of the configuration that makes no sense.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[error("`{key}` is {}: it must be {must}", crate::ranges::plain(*value))]
-pub struct ConfigError {
+pub struct FusionConfigError {
     /// The key, with its section.
     pub key: &'static str,
     /// What it is.

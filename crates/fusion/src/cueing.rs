@@ -95,7 +95,8 @@ pub(crate) struct OwnClock {
 pub(crate) fn cues(
     camera: &CameraName,
     known: &KnownCamera,
-    (now, clock): (Timestamp, OwnClock),
+    now: Timestamp,
+    clock: OwnClock,
     targets: &[CueTarget],
     max_range_m: f64,
 ) -> CueFrame {
@@ -104,7 +105,7 @@ pub(crate) fn cues(
     // A camera needs no cue for what it alone sees itself.
     let others = targets.iter().filter(|target| target.of.camera != camera.as_str());
     let mut cues: Vec<Cue> = others
-        .filter_map(|target| cue((known, &uncertainty), own_now, target))
+        .filter_map(|target| cue(known, &uncertainty, own_now, target))
         .filter(|cue| cue.range_m <= max_range_m)
         .collect();
     let is_track = |cue: &Cue| cue.of.as_ref().is_some_and(|of| of.track_id != 0);
@@ -121,18 +122,19 @@ pub(crate) fn cues(
 /// The cue of one target for one camera; `None` if the target lies at the camera itself, or may lie
 /// anywhere.
 fn cue(
-    camera: (&KnownCamera, &CameraUncertainty),
+    known: &KnownCamera,
+    uncertainty: &CameraUncertainty,
     own_now: Timestamp,
     target: &CueTarget,
 ) -> Option<Cue> {
-    let origin = camera.0.camera.pose().position();
+    let origin = known.camera.pose().position();
     let here = &target.ahead[0];
     let away = here.position() - origin;
     let range_m = away.norm();
     // sd(ln r) = sqrt(a' P a) / r^2 with a = p - c, of length r.
     let along = away.dot(&(here.position_covariance() * away)).max(0.0);
     let ahead = target.ahead.iter().zip(AHEAD_S).map(|(state, ahead_s)| {
-        expected(camera, state, target.seen_from, own_now.plus_seconds(ahead_s))
+        expected(known, uncertainty, state, target.seen_from, own_now.plus_seconds(ahead_s))
     });
     Some(Cue {
         of: Some(target.of.clone()),
@@ -145,7 +147,8 @@ fn cue(
 /// The predicted bearing of a state in the camera's own frame; `None` if it is too uncertain for a
 /// bearing.
 fn expected(
-    (known, uncertainty): (&KnownCamera, &CameraUncertainty),
+    known: &KnownCamera,
+    uncertainty: &CameraUncertainty,
     state: &KinematicState,
     seen_from: Option<Point3<f64>>,
     time: Timestamp,

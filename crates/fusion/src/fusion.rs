@@ -10,7 +10,7 @@ use crossfix_message::{
     TrackFrame,
 };
 
-use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera, PoseFinding, ScaleSample};
+use crate::cameras::{CameraTrust, Cameras, Fittings, KnownCamera, PoseFinding, ScaleSample};
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::cueing::Cueing;
 use crate::event_time::{EventBuffer, ExposureArrival, ReorderQueue};
@@ -25,7 +25,7 @@ use smoothing::Smoothing;
 
 use crate::uncertainty::{CorrelatedNoise, pose_covariance_of_careful_survey};
 use crate::unmet::{Unmet, WhyNothing};
-use crate::{ConfigError, Counters, FusionConfig};
+use crate::{Counters, FusionConfig, FusionConfigError};
 
 /// A result of the fusion centre.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,7 +42,7 @@ pub enum Output {
     /// A frame, or a part of one, was not used.
     Rejected(Rejection),
     /// A camera is excluded, or used again.
-    Camera(CameraName, CameraStanding),
+    Camera(CameraName, CameraTrust),
 }
 
 /// The fusion centre's judgement of a camera.
@@ -51,7 +51,7 @@ pub struct CameraReport {
     /// The camera.
     pub camera: CameraName,
     /// How far its bearings are believed.
-    pub standing: CameraStanding,
+    pub standing: CameraTrust,
     /// Factor by which its reported covariances are multiplied.
     pub noise_factor: f64,
     /// Its clock; `None` until the camera has been heard.
@@ -91,8 +91,8 @@ impl Fusion {
     /// A fusion centre that does not know any camera yet.
     ///
     /// # Errors
-    /// [`ConfigError`] if a number of the configuration makes no sense.
-    pub fn new(config: FusionConfig) -> Result<Self, ConfigError> {
+    /// [`FusionConfigError`] if a number of the configuration makes no sense.
+    pub fn new(config: FusionConfig) -> Result<Self, FusionConfigError> {
         config.validate()?;
         let motion = MotionSetup::new(&config.tracking)?;
         Ok(Self {
@@ -373,9 +373,10 @@ impl Fusion {
         for start in initiator.hand_over(exposure, &step.used, known, tracker.motion()) {
             changes.extend(tracker.adopt(start, cameras));
         }
-        let seen = (step.third_differences.as_slice(), step.unassigned);
         if let Some(camera) = cameras.get_mut(&exposure.camera) {
-            camera.learn_noise(exposure.time, seen, tracker.motion().holding_s);
+            let holding_s = tracker.motion().holding_s;
+            let differences = &step.third_differences;
+            camera.learn_noise(exposure.time, differences, step.unassigned, holding_s);
         }
         (step.fittings, step.used)
     }
@@ -409,7 +410,7 @@ impl Fusion {
         }
         if let Some(standing) = judgement.standing {
             self.counters.count(match standing {
-                CameraStanding::Excluded => "cameras_excluded",
+                CameraTrust::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
             });
             outputs.push(Output::Camera(exposure.camera.clone(), standing));
@@ -426,11 +427,11 @@ impl Fusion {
     ) {
         let changed = self.cameras.get_mut(camera).and_then(|known| known.note_time(time, in_time));
         if let Some(standing) = changed {
-            if standing == CameraStanding::Excluded {
+            if standing == CameraTrust::Excluded {
                 self.site_time.doubt(camera);
             }
             self.counters.count(match standing {
-                CameraStanding::Excluded => "cameras_out_of_time",
+                CameraTrust::Excluded => "cameras_out_of_time",
                 _ => "cameras_in_time_again",
             });
             outputs.push(Output::Camera(camera.clone(), standing));

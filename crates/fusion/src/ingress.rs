@@ -8,6 +8,7 @@ use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, 
 use nalgebra::Matrix2;
 
 use crate::cameras::{KnownCamera, Pointed, Rooted};
+use crate::track::TrackBearing;
 use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
 
@@ -48,6 +49,11 @@ pub struct Exposure {
 }
 
 impl Exposure {
+    /// A line of its camera at its time, as tracks take it in.
+    pub(crate) fn bearing<'a>(&'a self, line: &'a SightLine) -> TrackBearing<'a> {
+        TrackBearing { camera: &self.camera, time: self.time, line, uncertainty: &self.uncertainty }
+    }
+
     /// The rejection of this exposure for a reason.
     pub(crate) fn refused(&self, reason: RejectionReason) -> Rejection {
         Rejection { camera: self.camera.to_string(), sequence: self.sequence, reason }

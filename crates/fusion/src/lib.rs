@@ -78,10 +78,10 @@ mod unmet;
 mod update;
 mod visibility;
 
-pub use cameras::{CameraStanding, PoseFinding};
+pub use cameras::{CameraTrust, PoseFinding};
 pub use clocks::ClockEstimate;
 pub use config::{
-    Bearings, Clocks, ConfigError, EventTime, FlightModel, FusionConfig, Initiation,
+    Bearings, Clocks, EventTime, FlightModel, FusionConfig, FusionConfigError, Initiation,
     InitiationMethod, Manoeuvres, SpatialSolver, Tracking, Weighting,
 };
 pub use counters::Counters;

@@ -4,7 +4,7 @@ use crossfix_filter::{
     ModeRates, MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual,
 };
 
-use crate::{ConfigError, Manoeuvres, Tracking};
+use crate::{FusionConfigError, Manoeuvres, Tracking};
 
 /// Standard deviation of a track's velocity after a manoeuvre that a detector saw, m/s per axis.
 /// With half of it a target of 15 m/s that turns back is four deviations off; with twice as much
@@ -37,7 +37,7 @@ pub(crate) enum ManoeuvreDetector {
 }
 
 impl MotionSetup {
-    pub(crate) fn new(config: &Tracking) -> Result<Self, ConfigError> {
+    pub(crate) fn new(config: &Tracking) -> Result<Self, FusionConfigError> {
         let single = MotionModels::single(config.acceleration_density);
         let (models, detector) = match config.manoeuvres {
             Manoeuvres::Models => {
@@ -67,7 +67,7 @@ impl MotionSetup {
                 (single, Some(ManoeuvreDetector::Innovation(detector)))
             }
         };
-        let models = models.ok_or(ConfigError {
+        let models = models.ok_or(FusionConfigError {
             key: "tracking.models",
             value: config.models.len() as f64,
             must: "one to four models with densities of 0 and more and positive shares".to_owned(),

@@ -5,7 +5,8 @@
 use crate::motion::MotionSetup;
 use crate::tracker::association::MAX_SCORE;
 use crate::{
-    ConfigError, FlightModel, FusionConfig, InitiationMethod, Manoeuvres, SpatialSolver, Weighting,
+    FlightModel, FusionConfig, FusionConfigError, InitiationMethod, Manoeuvres, SpatialSolver,
+    Weighting,
 };
 
 /// A number of the configuration, with the range in which it makes sense.
@@ -49,13 +50,17 @@ const OF_INNOVATION: &[NumberKey] = &[
 ];
 
 impl Range {
-    fn check(&self) -> Result<(), ConfigError> {
+    fn check(&self) -> Result<(), FusionConfigError> {
         let &Self { key, value, least, most } = self;
         // NaN is in no range.
         if (least..=most).contains(&value) {
             return Ok(());
         }
-        Err(ConfigError { key, value, must: format!("from {} to {}", plain(least), plain(most)) })
+        Err(FusionConfigError {
+            key,
+            value,
+            must: format!("from {} to {}", plain(least), plain(most)),
+        })
     }
 }
 
@@ -72,8 +77,8 @@ impl FusionConfig {
     /// Checks every number against its range.
     ///
     /// # Errors
-    /// The first [`ConfigError`].
-    pub fn validate(&self) -> Result<(), ConfigError> {
+    /// The first [`FusionConfigError`].
+    pub fn validate(&self) -> Result<(), FusionConfigError> {
         let ranges = [self.time_and_bearings(), self.initiation_ranges(), self.tracking_ranges()];
         ranges.iter().flatten().try_for_each(Range::check)?;
         self.models()?;
@@ -83,7 +88,7 @@ impl FusionConfig {
 
     /// Finds a number that differs from the default although none of the chosen methods uses it:
     /// whoever has set it thinks that it does something.
-    fn unused(&self) -> Option<ConfigError> {
+    fn unused(&self) -> Option<FusionConfigError> {
         let Self { bearings, initiation, tracking, .. } = self;
         let usual = Self::default();
         let grouping = initiation.method == InitiationMethod::Grouping;
@@ -106,7 +111,7 @@ impl FusionConfig {
             unused.filter(|(_, number)| number(self).to_bits() != number(&usual).to_bits());
         set.next().map(|(key, number)| {
             let must = "left out: the method that is chosen does not use it".to_owned();
-            ConfigError { key, value: number(self), must }
+            FusionConfigError { key, value: number(self), must }
         })
     }
 
@@ -157,14 +162,14 @@ impl FusionConfig {
         ]
     }
 
-    fn models(&self) -> Result<(), ConfigError> {
+    fn models(&self) -> Result<(), FusionConfigError> {
         let key = "tracking.models.acceleration_density";
         let density = |model: &FlightModel| range(key, model.acceleration_density, 0.0, 1e6);
         self.tracking.models.iter().map(density).try_for_each(|range| range.check())?;
         MotionSetup::new(&self.tracking).map(drop)
     }
 
-    fn probabilities(&self) -> Result<(), ConfigError> {
+    fn probabilities(&self) -> Result<(), FusionConfigError> {
         let Self { initiation, tracking, .. } = self;
         let probabilities = [
             ("initiation.spatial_gate_probability", initiation.spatial_gate_probability),
@@ -174,7 +179,7 @@ impl FusionConfig {
         ];
         for (key, value) in probabilities {
             if !(value > 0.0 && value < 1.0) {
-                return Err(ConfigError {
+                return Err(FusionConfigError {
                     key,
                     value,
                     must: "a probability between 0 and 1".to_owned(),

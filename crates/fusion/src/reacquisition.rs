@@ -57,9 +57,9 @@ impl ReacquisitionContext<'_> {
     /// strangers, the best first.
     fn fits(&self, track: &Track, owner: TrackId) -> Vec<(f64, usize)> {
         let Self { exposure, known, motion, config, .. } = self;
-        let seen_from = (&exposure.camera, known.camera.pose().position());
+        let (camera, origin) = (&exposure.camera, known.camera.pose().position());
         let Some(expected) =
-            track.expectation(exposure.time, seen_from, &exposure.uncertainty, motion)
+            track.expectation(exposure.time, camera, origin, &exposure.uncertainty, motion)
         else {
             return Vec::new();
         };
@@ -84,14 +84,9 @@ impl ReacquisitionContext<'_> {
 
     /// A copy of a track, updated with a sighting; `None` if the numbers fail.
     fn taken(&self, track: &Track, index: usize) -> Option<Track> {
-        let Exposure { camera, time, uncertainty, sightings, .. } = self.exposure;
+        let Exposure { camera, time, sightings, .. } = self.exposure;
         let mut track = track.clone();
-        track.measurement_update(
-            camera,
-            &sightings[index].line,
-            (*time, uncertainty),
-            self.motion,
-        )?;
+        track.measurement_update(self.exposure.bearing(&sightings[index].line), self.motion)?;
         track.look(camera, *time, true, self.config.detection_probability, self.motion);
         Some(track)
     }

@@ -39,11 +39,15 @@ const SHARE_OF_LATENESS: f64 = 0.5;
 /// A camera whose clock has gone forward has stood still if the others have gone on by this share
 /// of the step. Any share between none and all of the step serves.
 const SHARE_OF_STEP: f64 = 0.5;
-/// Most frames that wait, and most bearings in them: memory is bounded. Where they are full, each
-/// clock is taken to have stepped for itself: with half of it thirty cameras of 30 Hz have 0.1 s to
-/// show that all have stepped, and not 0.2 s.
-const MOST_WAITING: usize = 200;
-const MOST_BEARINGS_WAITING: usize = 20_000;
+/// Bounds on what waits. Beyond them each clock is taken to have stepped for itself: with half of
+/// them thirty cameras of 30 Hz have 0.1 s to show that all have stepped, and not 0.2 s.
+struct Most {
+    frames: usize,
+    /// Bearings in all of them.
+    bearings: usize,
+}
+
+const MOST: Most = Most { frames: 200, bearings: 20_000 };
 
 /// A frame as stamped by a clock that is `ahead_s` ahead of its camera's.
 pub(crate) fn moved(frame: &BearingFrame, ahead_s: f64) -> BearingFrame {
@@ -345,7 +349,7 @@ impl SiteTime {
             rhythm.gone_s - pending.gone_s.get(name).copied().unwrap_or(0.0)
         };
         let bearings: usize = pending.frames.iter().map(|frame| frame.tracks.len()).sum();
-        let is_full = pending.frames.len() >= MOST_WAITING || bearings > MOST_BEARINGS_WAITING;
+        let is_full = pending.frames.len() >= MOST.frames || bearings > MOST.bearings;
         let is_late = self.live().map(gone_s).fold(0.0, f64::max) > self.longest_s;
         (is_full || is_late || self.live().count() < 2).then_some(None)
     }

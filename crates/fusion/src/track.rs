@@ -80,6 +80,16 @@ pub(crate) struct Taken {
     pub(crate) third_differences: Option<ThirdDifferences>,
 }
 
+/// A bearing as a track takes it in.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct TrackBearing<'a> {
+    pub(crate) camera: &'a CameraName,
+    pub(crate) time: Timestamp,
+    pub(crate) line: &'a SightLine,
+    /// What is uncertain of all bearings of the camera.
+    pub(crate) uncertainty: &'a CameraUncertainty,
+}
+
 /// A 3D track of one target, updated by single bearings of single cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Track {
@@ -172,7 +182,9 @@ impl Track {
     /// A tentative track of a target that one camera alone has followed: see [`Self::start`].
     pub(crate) fn start_alone(
         fix: &Fix,
-        (camera, line, uncertainty): (&CameraName, &TimedLine, CameraUncertainty),
+        camera: &CameraName,
+        line: &TimedLine,
+        uncertainty: CameraUncertainty,
         motion: &MotionSetup,
     ) -> Self {
         let mut track = Self::start(fix, [(camera, line, uncertainty)], motion);
@@ -350,15 +362,13 @@ impl Track {
     /// the covariance.
     pub(crate) fn measurement_update(
         &mut self,
-        camera: &CameraName,
-        line: &SightLine,
-        (time, uncertainty): (Timestamp, &CameraUncertainty),
+        bearing: TrackBearing<'_>,
         motion: &MotionSetup,
     ) -> Option<Taken> {
+        let TrackBearing { camera, time, line, uncertainty } = bearing;
         let interval = time.seconds_since(self.updated);
         let innovation = self.innovation(time, line)?;
-        let manoeuvre =
-            self.sees_manoeuvre(&innovation, interval, (camera, line), uncertainty, motion);
+        let manoeuvre = self.sees_manoeuvre(&innovation, &bearing, motion);
         if manoeuvre {
             self.imm.reinitialise(REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD);
             self.settle_past();
@@ -368,10 +378,9 @@ impl Track {
         // about it.
         let seen_from = self.alone();
         let known = self.errors_of(camera, interval);
-        let bearing = (line, &known);
         // A lasting error may have been drawn again since (a label that jumps): take the likelier
         // case.
-        let anew = self.renewed(&innovation, interval, bearing, uncertainty, motion);
+        let anew = self.renewed(&innovation, &bearing, &known, motion);
         let errors = anew.unwrap_or(known);
         let measured = Measured { line, camera: uncertainty, errors: &errors };
         let mut results: Vec<Option<Updated>> = Vec::with_capacity(crossfix_filter::MAX_MODELS);
@@ -385,8 +394,8 @@ impl Track {
             self.renew(camera);
         }
         // The errors outside the state are carried once, with the mean of all models' updates.
-        let nis = self.carry((camera, uncertainty.lasting), (time, interval), &results);
-        self.gather_information((camera, interval), line, uncertainty);
+        let nis = self.carry(&bearing, &results);
+        self.gather_information(&bearing);
         self.updated = time;
         self.follower = Some(line.origin);
         self.solver = Solver::Kalman;
@@ -400,7 +409,7 @@ impl Track {
         let lately = |ties: &&Ties| ties.has_seen_lately(time, motion.holding_s);
         self.held = self.ties.values().filter(lately).count() >= 2;
         self.range_again(line, motion);
-        self.gather(camera, &innovation, line, uncertainty);
+        self.gather(&bearing, &innovation);
         let third_differences = self.third_differences(camera, line, motion);
         Some(Taken { manoeuvre, third_differences })
     }
@@ -419,8 +428,8 @@ impl Track {
             // the time to make up for.
             let silent_s = silent.filter(|silent_s| *silent_s > 0.0).fold(f64::INFINITY, f64::min);
             if silent_s.is_finite() {
-                let models = (motion.models(true), motion.models(false));
-                self.imm.widen_along(silent_s, &line.direction, models);
+                let (before, since) = (motion.models(true), motion.models(false));
+                self.imm.widen_along(silent_s, &line.direction, before, since);
             }
         }
     }

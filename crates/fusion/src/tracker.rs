@@ -186,9 +186,14 @@ impl Tracker {
         exposure: &Exposure,
         known: &KnownCamera,
     ) -> Option<usize> {
-        let camera = (&exposure.camera, known.camera.pose().position());
-        let expected =
-            track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
+        let (camera, origin) = (&exposure.camera, known.camera.pose().position());
+        let expected = track.expectation(
+            exposure.time,
+            camera,
+            origin,
+            &exposure.uncertainty,
+            &self.motion,
+        )?;
         let fits = exposure.sightings.iter().enumerate();
         let fits =
             fits.filter_map(|(i, s)| Some((expected.fit(&s.line, self.gate)?.gate_distance, i)));
@@ -222,10 +227,15 @@ impl Tracker {
     /// How well an exposure fits the confirmed tracks: the sum over the tracks of the best
     /// log-likelihood ratio, of a bearing being this track's against being clutter.
     pub(crate) fn fit(&self, exposure: &Exposure, known: &KnownCamera) -> f64 {
-        let camera = (&exposure.camera, known.camera.pose().position());
+        let (camera, origin) = (&exposure.camera, known.camera.pose().position());
         let best = |track: &Track| {
-            let expected =
-                track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
+            let expected = track.expectation(
+                exposure.time,
+                camera,
+                origin,
+                &exposure.uncertainty,
+                &self.motion,
+            )?;
             let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
             // ln(N / clutter), P_D left out: it is the same for both times that are compared.
             fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)

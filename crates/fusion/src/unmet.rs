@@ -39,12 +39,17 @@ const MAX_APART_S: f64 = 0.5;
 /// range. No survey is as good; a pose that was copied is the same to the last digit. With half of
 /// it the same.
 const SAME_PLACE_M: f64 = 1e-3;
-/// Most lines of one exposure that are compared: time is bounded. With half of it the one target
-/// among twenty image tracks may not be compared.
-const MAX_LINES: usize = 30;
-/// Most image tracks of a camera that are remembered: memory is bounded. Beyond it new ones are not
-/// looked at until old ones have gone.
-const MAX_IMAGE_TRACKS: usize = 1_000;
+/// Bounds on time and memory.
+struct Most {
+    /// Lines of one exposure that are compared. With half of it the one target among twenty image
+    /// tracks may not be compared.
+    lines: usize,
+    /// Image tracks of a camera that are remembered. Beyond it new ones are not looked at until old
+    /// ones have gone; half of it is more than an image holds.
+    image_tracks: usize,
+}
+
+const MOST: Most = Most { lines: 30, image_tracks: 1_000 };
 
 /// Why no target is found.
 #[derive(Clone, Debug, PartialEq)]
@@ -295,13 +300,13 @@ impl Unmet {
         for (Sighting { image_track, rooted, .. }, (_, timed)) in
             exposure.sightings.iter().zip(lines_with_pose(exposure))
         {
-            let full = seen.since.len() >= MAX_IMAGE_TRACKS;
+            let full = seen.since.len() >= MOST.image_tracks;
             if *rooted == Rooted::Yes || (full && !seen.since.contains_key(image_track)) {
                 continue;
             }
             let (first, last) = seen.since.entry(*image_track).or_insert((now, now));
             *last = now;
-            if now.seconds_since(*first) >= SOMETHING_S && lines.len() < MAX_LINES {
+            if now.seconds_since(*first) >= SOMETHING_S && lines.len() < MOST.lines {
                 lines.push(timed);
             }
         }

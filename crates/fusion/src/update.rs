@@ -13,7 +13,7 @@ use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, SightLine};
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix6, Matrix6x2, Point3, Vector2, Vector6};
 
-use crate::range_chart::StateChart;
+use crate::range_chart::{ChartPoint, StateChart};
 use crate::uncertainty::{CameraUncertainty, SharedErrors, SharedTies, Shifts};
 
 /// Most rounds of the iterated update: with a range known to a factor of three it takes four or
@@ -106,6 +106,61 @@ impl Told {
     }
 }
 
+/// The bearing's measurement equation, linearised at one point of the chart.
+struct Linearised {
+    /// H: Jacobian by the first three coordinates; a bearing depends on the position only.
+    by: Matrix2x3<f64>,
+    shifts: Shifts,
+    /// The bearing's noise, with the spread of the camera's errors.
+    noise: Matrix2<f64>,
+    /// P H' + X J', the covariance of state and bearing.
+    across: Matrix6x2<f64>,
+    /// S^-1 and |S|.
+    inverse: Matrix2<f64>,
+    determinant: f64,
+    innovation: Vector2<f64>,
+    /// Distance of the point from the camera, m.
+    range: f64,
+}
+
+impl Linearised {
+    /// At the point with these coordinates; P and X are the state's covariance and ties. `None` if
+    /// the numbers fail.
+    fn at(
+        point: &ChartPoint,
+        coordinates: &Vector6<f64>,
+        covariance: &Matrix6<f64>,
+        ties: &SharedTies,
+        &Measured { line, camera, errors }: &Measured<'_>,
+    ) -> Option<Self> {
+        let model = BearingModel::new(line.origin, point.place)?;
+        let offset = model.offset(line)?;
+        let shifts = camera.shifts(&model, point.velocity);
+        let by: Matrix2x3<f64> = model.by_position() * point.place_by;
+        let tied: Matrix6x2<f64> = ties * shifts.transpose();
+        // Cov(state, bearing) = P H' + X J', and Cov(predicted position, shift) = H X J'.
+        let seen: Matrix6x2<f64> = covariance.fixed_columns::<3>(0) * by.transpose();
+        let cross: Matrix2<f64> = by * tied.fixed_rows::<3>(0);
+        let noise = camera.noise(&model, point.velocity, &model.covariance_of(line))
+            + errors.spread(&shifts);
+        // S = H P H' + H X J' + J X' H' + J W J' + R, with W the covariance of s.
+        let spread = by * seen.fixed_rows::<3>(0) + cross + cross.transpose() + noise;
+        let (determinant, inverse) = (spread.determinant(), spread.try_inverse()?);
+        // z of the iterated filter, linearised at this point: offset + H x - J E(s).
+        let innovation = offset + by * coordinates.fixed_rows::<3>(0) - shifts * errors.mean;
+        (determinant > 0.0 && spread.m11 > 0.0).then(|| Self {
+            by,
+            shifts,
+            noise,
+            across: seen + tied,
+            inverse,
+            determinant,
+            innovation,
+            range: model.range,
+        })
+    }
+}
+
 /// The state updated by a bearing of the same time. `seen_from` is the position of the camera that
 /// alone follows the target, so that the range from there is uncertain. `None` if the numbers fail.
 pub(crate) fn updated(
@@ -113,53 +168,33 @@ pub(crate) fn updated(
     seen_from: Option<Point3<f64>>,
     measured: &Measured<'_>,
 ) -> Option<Updated> {
-    let Measured { line, camera, errors } = *measured;
     let chart = match seen_from {
         Some(origin) => StateChart::by_range(origin, prior)?,
         None => StateChart::cartesian(prior),
     };
     // P and X in the chart's coordinates, whose origin is the prior mean.
-    let (covariance, ties) = chart.expressed(&prior.covariance, &errors.ties);
+    let (covariance, ties) = chart.expressed(&prior.covariance, &measured.errors.ties);
     // In the range chart a bearing of the following camera itself measures the direction alone,
     // linearly: one round is enough.
-    let is_own = seen_from == Some(line.origin);
+    let is_own = seen_from == Some(measured.line.origin);
     let mut coordinates = Vector6::zeros();
     if !is_own && seen_from.is_some() && covariance.m33 > VAGUE_LOG_RANGE_SD.powi(2) {
-        coordinates[2] = chart.nearest_to(line)?;
+        coordinates[2] = chart.nearest_to(measured.line)?;
     }
     for round in 1.. {
         let point = chart.point(&coordinates);
-        let model = BearingModel::new(line.origin, point.place)?;
-        let offset = model.offset(line)?;
-        let shifts = camera.shifts(&model, point.velocity);
-        // A bearing depends on the position only, the first three coordinates: H = [by, 0].
-        let by: Matrix2x3<f64> = model.by_position() * point.place_by;
-        let tied: Matrix6x2<f64> = ties * shifts.transpose();
-        // Cov(state, bearing) = P H' + X J', and Cov(predicted position, shift) = H X J'.
-        let seen: Matrix6x2<f64> = covariance.fixed_columns::<3>(0) * by.transpose();
-        let across = seen + tied;
-        let cross: Matrix2<f64> = by * tied.fixed_rows::<3>(0);
-        let noise = camera.noise(&model, point.velocity, &model.covariance_of(line))
-            + errors.spread(&shifts);
-        // S = H P H' + H X J' + J X' H' + J W J' + R, with W the covariance of s.
-        let spread = by * seen.fixed_rows::<3>(0) + cross + cross.transpose() + noise;
-        let determinant = spread.determinant();
-        let inverse = spread.try_inverse()?;
-        if !(determinant > 0.0 && spread.m11 > 0.0) {
-            return None;
-        }
-        // z of the iterated filter, linearised at this round's point: offset + H x - J E(s).
-        let innovation: Vector2<f64> =
-            offset + by * coordinates.fixed_rows::<3>(0) - shifts * errors.mean;
+        let seen = Linearised::at(&point, &coordinates, &covariance, &ties, measured)?;
         // K = (P H' + X J') S^-1, and the next point is K z.
-        let gain = across * inverse;
-        let next = gain * innovation;
-        let moved = (point.place_by * (next - coordinates).fixed_rows::<3>(0)).norm() / model.range;
+        let gain = seen.across * seen.inverse;
+        let next = gain * seen.innovation;
+        let moved = point.place_by * (next - coordinates).fixed_rows::<3>(0);
+        let moved = moved.norm() / seen.range;
         coordinates = next;
-        let settled = moved.powi(2) < SETTLED * (noise.trace() / 2.0).sqrt();
+        let settled = moved.powi(2) < SETTLED * (seen.noise.trace() / 2.0).sqrt();
         if !(is_own || settled || round == MAX_ROUNDS) {
             continue;
         }
+        let Linearised { innovation, across, inverse, determinant, by, shifts, .. } = seen;
         // Only rounding can make it negative, where S is nearly singular.
         let nis = innovation.dot(&(inverse * innovation)).max(0.0);
         let point = chart.point(&coordinates);

@@ -1,6 +1,6 @@
 use std::fmt;
 
-use crate::Timestamp;
+use crate::{Timestamp, TrackEvent, TrackEventKind};
 
 /// Number of track identities reserved for one run of the fusion centre. A run that makes more
 /// tracks continues into the identities of a run that began a second later; they stay unique as
@@ -46,5 +46,24 @@ impl TrackNumber {
 impl fmt::Display for TrackNumber {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.in_run())
+    }
+}
+
+/// What happened to which track, for people: `track 3 merged into 1`.
+impl fmt::Display for TrackEvent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let happened = match self.kind() {
+            TrackEventKind::Unspecified => "changed",
+            TrackEventKind::Born => "born",
+            TrackEventKind::Confirmed => "confirmed",
+            TrackEventKind::Lost => "lost",
+            TrackEventKind::Merged => "merged",
+            TrackEventKind::Manoeuvre => "manoeuvres",
+        };
+        write!(f, "track {} {happened}", TrackNumber(self.track_id))?;
+        match self.other_id {
+            0 => Ok(()),
+            other => write!(f, " into {}", TrackNumber(other)),
+        }
     }
 }

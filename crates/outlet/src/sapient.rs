@@ -7,7 +7,7 @@ use sapient_rs::bsi_flex_335_v2_0 as sapient;
 use sha2::{Digest, Sha256};
 
 use crate::text::state;
-use crate::{Outlet, Refused, Snapshot, Target};
+use crate::{OtherSideRefuses, Outlet, Snapshot, Target};
 
 /// The interface's version, spelt as its validators require.
 const VERSION: &str = "BSI Flex 335 v2.0";
@@ -117,12 +117,12 @@ impl Sapient {
     }
 
     /// Takes the complete frames out of the inbox.
-    fn whole_frames(&mut self) -> Result<Vec<Vec<u8>>, Refused> {
+    fn whole_frames(&mut self) -> Result<Vec<Vec<u8>>, OtherSideRefuses> {
         let mut frames = Vec::new();
         while let Some((head, rest)) = self.inbox.split_first_chunk::<4>() {
             let length = u32::from_le_bytes(*head) as usize;
             if length > MOST_FRAME_BYTES {
-                return Err(Refused::Malformed(format!("a message of {length} bytes")));
+                return Err(OtherSideRefuses::Malformed(format!("a message of {length} bytes")));
             }
             let Some(frame) = rest.get(..length) else { break };
             frames.push(frame.to_vec());
@@ -185,12 +185,15 @@ fn velocity(target: &Target) -> sapient::EnuVelocity {
     }
 }
 
-fn registration(site: &SiteName) -> sapient::Registration {
+fn seconds(value: f32) -> sapient::registration::Duration {
     use sapient::registration as r;
+    r::Duration { units: Some(r::TimeUnits::Seconds.into()), value: Some(value) }
+}
 
-    let seconds =
-        |value: f32| r::Duration { units: Some(r::TimeUnits::Seconds.into()), value: Some(value) };
-    let degrees = r::LocationType {
+/// Places in degrees and metres of WGS84.
+fn degrees() -> sapient::registration::LocationType {
+    use sapient::registration as r;
+    r::LocationType {
         coordinates_oneof: Some(r::location_type::CoordinatesOneof::LocationUnits(
             sapient::LocationCoordinateSystem::LatLngDegM.into(),
         )),
@@ -198,7 +201,12 @@ fn registration(site: &SiteName) -> sapient::Registration {
             sapient::LocationDatum::Wgs84E.into(),
         )),
         ..Default::default()
-    };
+    }
+}
+
+/// What is reported of a target.
+fn detections() -> sapient::registration::DetectionDefinition {
+    use sapient::registration as r;
     let metres_a_second = r::VelocityType {
         velocity_units_oneof: Some(r::velocity_type::VelocityUnitsOneof::EnuVelocityUnits(
             sapient::EnuVelocityUnits {
@@ -211,8 +219,8 @@ fn registration(site: &SiteName) -> sapient::Registration {
         )),
         ..Default::default()
     };
-    let detections = r::DetectionDefinition {
-        location_type: Some(degrees.clone()),
+    r::DetectionDefinition {
+        location_type: Some(degrees()),
         velocity_type: Some(metres_a_second),
         geometric_error: Some(r::GeometricError {
             r#type: Some("Standard Deviation".to_owned()),
@@ -221,25 +229,34 @@ fn registration(site: &SiteName) -> sapient::Registration {
             ..Default::default()
         }),
         ..Default::default()
-    };
+    }
+}
+
+/// The one mode: it tracks all the time, and takes no tasks.
+fn mode() -> sapient::registration::ModeDefinition {
+    use sapient::registration as r;
     let region = r::RegionDefinition {
         region_type: vec![r::RegionType::AreaOfInterest.into()],
-        region_area: vec![degrees.clone()],
+        region_area: vec![degrees()],
         ..Default::default()
     };
-    let mode = r::ModeDefinition {
+    r::ModeDefinition {
         mode_name: Some("Default".to_owned()),
         mode_type: Some(r::ModeType::Permanent.into()),
         settle_time: Some(seconds(1.0)),
         tracking_type: Some(r::TrackingType::Track.into()),
-        detection_definition: vec![detections],
+        detection_definition: vec![detections()],
         task: Some(r::TaskDefinition {
             concurrent_tasks: Some(0),
             region_definition: Some(region),
             ..Default::default()
         }),
         ..Default::default()
-    };
+    }
+}
+
+fn registration(site: &SiteName) -> sapient::Registration {
+    use sapient::registration as r;
     let node = |kind: r::NodeType| r::NodeDefinition {
         node_type: Some(kind.into()),
         ..Default::default()
@@ -256,10 +273,10 @@ fn registration(site: &SiteName) -> sapient::Registration {
         }],
         status_definition: Some(r::StatusDefinition {
             status_interval: Some(seconds(STATUS_PERIOD_S as f32)),
-            location_definition: Some(degrees),
+            location_definition: Some(degrees()),
             ..Default::default()
         }),
-        mode_definition: vec![mode],
+        mode_definition: vec![mode()],
         config_data: vec![r::ConfigurationData {
             manufacturer: "Crossfix".to_owned(),
             model: "Crossfix".to_owned(),
@@ -279,14 +296,16 @@ impl Outlet for Sapient {
 
     /// Takes in the answer to the registration. Tasks and other messages are ignored: they are for
     /// nodes that can be steered.
-    fn heard(&mut self, bytes: &[u8]) -> Result<(), Refused> {
+    fn heard(&mut self, bytes: &[u8]) -> Result<(), OtherSideRefuses> {
         self.inbox.extend(bytes);
         for frame in self.whole_frames()? {
             let message = sapient::SapientMessage::decode(frame.as_slice())
-                .map_err(|error| Refused::Malformed(error.to_string()))?;
+                .map_err(|error| OtherSideRefuses::Malformed(error.to_string()))?;
             if let Some(Content::RegistrationAck(answer)) = message.content {
                 if answer.acceptance == Some(false) {
-                    return Err(Refused::Registration(answer.ack_response_reason.join("; ")));
+                    return Err(OtherSideRefuses::Registration(
+                        answer.ack_response_reason.join("; "),
+                    ));
                 }
                 self.is_registered = true;
             }
@@ -383,8 +402,11 @@ mod tests {
         assert!(!sapient.is_ready());
         sapient.heard(&yes[7..]).unwrap();
         assert!(sapient.is_ready());
-        assert_eq!(sapient.heard(&ack(false)), Err(Refused::Registration("no".to_owned())));
+        assert_eq!(
+            sapient.heard(&ack(false)),
+            Err(OtherSideRefuses::Registration("no".to_owned()))
+        );
         let endless = sapient.heard(&[0xff; 8]);
-        assert!(matches!(endless, Err(Refused::Malformed(_))), "{endless:?}");
+        assert!(matches!(endless, Err(OtherSideRefuses::Malformed(_))), "{endless:?}");
     }
 }

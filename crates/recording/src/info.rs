@@ -1,8 +1,8 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
 use std::path::Path;
 
-use crossfix_message::{Channel, Health, Timestamp, decode};
+use crossfix_message::{CameraName, Channel, Health, Timestamp, decode, glance};
 use serde::Serialize;
 
 use crate::{Damage, Entry, ReadFailure, RecordingError, RecordingReader, Source, schema_of};
@@ -53,6 +53,10 @@ impl LastHealth {
 pub struct RecordingInfo {
     /// Ordered by topic.
     pub channels: Vec<ChannelInfo>,
+    /// The cameras that it has messages of.
+    pub cameras: BTreeSet<CameraName>,
+    /// Number of messages of a newer major version, which this build cannot read.
+    pub newer: u64,
     /// Number of messages on topics that are not Crossfix's.
     pub foreign: u64,
     /// Who wrote it, if the file states it.
@@ -71,10 +75,15 @@ impl RecordingInfo {
     pub fn of(path: &Path) -> Result<Self, RecordingError> {
         let mut channels: BTreeMap<String, ChannelInfo> = BTreeMap::new();
         let mut health = BTreeMap::new();
+        let mut cameras = BTreeSet::new();
+        let mut newer = 0;
         let report = RecordingReader::open(path)?.for_each(|entry| {
             if let Some(said) = LastHealth::read(&entry) {
                 health.insert(said.0, said.1);
             }
+            let seen = glance(&entry.key.channel, &entry.data).ok().flatten();
+            newer += u64::from(seen.is_some_and(|seen| !seen.is_readable));
+            cameras.extend(entry.key.channel.camera().cloned());
             let topic = entry.key.to_string();
             let channel = channels.entry(topic.clone()).or_insert_with(|| ChannelInfo {
                 topic,
@@ -93,6 +102,8 @@ impl RecordingInfo {
         match report {
             Ok(report) => Ok(Self {
                 channels: channels.into_values().collect(),
+                cameras,
+                newer,
                 foreign: report.foreign,
                 source: report.source,
                 health,

@@ -46,4 +46,4 @@ pub use security::{
     AUTHORITY_FILE, Authority, AuthorityError, Credentials, CredentialsError, HandshakeError,
     Identity, IdentityError, Issued, OwnCertificate, Security, Validity, connect, handshake,
 };
-pub use subscription::{Received, Refused, Subscription};
+pub use subscription::{Received, RefusedCounts, Subscription};

@@ -30,7 +30,7 @@ pub struct Received {
 
 /// Counts of messages that a subscription did not hand on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Refused {
+pub struct RefusedCounts {
     /// Messages that were dropped as too many waited for the program.
     pub dropped: u64,
     /// Messages longer than any valid one.
@@ -125,8 +125,8 @@ impl Subscription {
     }
 
     /// Counts so far.
-    pub fn refused(&self) -> Refused {
-        Refused {
+    pub fn refused(&self) -> RefusedCounts {
+        RefusedCounts {
             dropped: self.counts.dropped.load(Ordering::Relaxed),
             too_long: self.counts.too_long.load(Ordering::Relaxed),
         }

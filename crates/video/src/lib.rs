@@ -66,12 +66,12 @@ pub use frame::{Arrival, CaptureTime, Frame, Pixels, TimedBy};
 pub use gige::{GigeCamera, GigeOptions, gige_cameras};
 pub use gstreamer::{GstreamerCamera, GstreamerOptions};
 pub use h264::{H264Encoder, decoding_time};
-pub use live::{Live, LiveCounts, Sight};
+pub use live::{Live, LiveCounts, LiveEvent};
 pub use live_camera::LiveCamera;
 pub use mp4::Mp4Source;
 pub use rtsp::{
-    Latency, Login, Mount, RtspCamera, RtspOptions, RtspServer, RtspSource, RtspTransport,
-    StreamAddress,
+    Login, RtspCamera, RtspOptions, RtspServer, RtspSource, RtspTransport, ServedStream,
+    StreamAddress, StreamLatency,
 };
 pub use sequence::SequenceSource;
 pub use still::decode_still;

@@ -39,7 +39,7 @@ const TROUBLES: usize = 64;
 
 /// What a live camera shows at the moment.
 #[derive(Debug)]
-pub enum Sight {
+pub enum LiveEvent {
     /// The next frame.
     Frame(Frame),
     /// One frame cannot be decoded, or the camera is lost; it is reopened automatically.
@@ -77,14 +77,14 @@ impl LiveCounts {
 ///
 /// ```
 /// use std::time::Duration;
-/// use crossfix_video::{Live, Sight, VideoError};
+/// use crossfix_video::{Live, LiveEvent, VideoError};
 ///
 /// // A camera that nobody has switched on.
 /// let live = Live::start(|_silence| {
 ///     Err(VideoError::Stream { url: "rtsp://nowhere/".into(), what: "nobody answers".into() })
 /// });
-/// assert!(matches!(live.next(Duration::from_secs(5)), Sight::Trouble(_)));
-/// assert!(matches!(live.next(Duration::ZERO), Sight::Nothing));
+/// assert!(matches!(live.next(Duration::from_secs(5)), LiveEvent::Trouble(_)));
+/// assert!(matches!(live.next(Duration::ZERO), LiveEvent::Nothing));
 /// ```
 #[derive(Debug)]
 pub struct Live {
@@ -165,19 +165,19 @@ impl Live {
     }
 
     /// The next trouble or frame; waits for `patience` at most. Troubles come before frames.
-    pub fn next(&self, patience: Duration) -> Sight {
+    pub fn next(&self, patience: Duration) -> LiveEvent {
         let until = Instant::now() + patience;
         let mut state = self.shared.locked();
         loop {
             if let Some(trouble) = state.troubles.pop_front() {
-                return Sight::Trouble(trouble);
+                return LiveEvent::Trouble(trouble);
             }
             if let Some(frame) = state.frames.pop_front() {
-                return Sight::Frame(frame);
+                return LiveEvent::Frame(frame);
             }
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                return Sight::Nothing;
+                return LiveEvent::Nothing;
             }
             let waited = self.shared.changed.wait_timeout(state, left);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;

@@ -6,7 +6,7 @@ use std::time::{Instant, SystemTime};
 
 use crossfix_message::Timestamp;
 
-use crate::{CaptureTime, Latency, TimedBy};
+use crate::{CaptureTime, StreamLatency, TimedBy};
 
 /// Seconds from the start of NTP's count, in 1900, to that of Unix's, in 1970.
 pub(crate) const NTP_TO_UNIX_S: u64 = 2_208_988_800;
@@ -198,7 +198,7 @@ impl ClockMemory {
 #[derive(Clone, Debug)]
 pub(crate) struct StreamClock {
     host: HostClock,
-    latency: Latency,
+    latency: StreamLatency,
     heeds_reports: bool,
     reports: Reports,
     arrivals: Arrivals,
@@ -211,7 +211,7 @@ impl StreamClock {
     /// A clock for a stream whose arrival times count from when the host's clock was read.
     pub(crate) fn new(
         host: HostClock,
-        latency: Latency,
+        latency: StreamLatency,
         heeds_reports: bool,
         memory: ClockMemory,
     ) -> Self {
@@ -220,7 +220,7 @@ impl StreamClock {
     }
 
     /// The same for a camera that is asked over a fast network what its clock shows.
-    pub(crate) fn of_asked(host: HostClock, latency: Latency) -> Self {
+    pub(crate) fn of_asked(host: HostClock, latency: StreamLatency) -> Self {
         let reports = Reports::new(ASKED_LEVEL_S);
         Self { reports, ..Self::new(host, latency, true, ClockMemory::default()) }
     }
@@ -249,7 +249,7 @@ impl StreamClock {
         // An arrival as if nothing had delayed the frame: every time below is relative to it.
         let unhindered = self.arrivals.unhindered_s(stream_s).unwrap_or(arrived_s);
         let arrival = self.host.wall.plus_seconds(unhindered);
-        let Latency { mean_s, sd_s } = self.latency;
+        let StreamLatency { mean_s, sd_s } = self.latency;
         let by_arrival = CaptureTime { time: arrival.plus_seconds(-mean_s), sd_s };
         let Some(time) = self.reports.time(stream_s) else {
             let remembered = self.memory.ahead_s(arrival, &self.host);
@@ -285,7 +285,7 @@ mod tests {
     use super::*;
 
     const HOST_S: f64 = 1.8e9;
-    const LATENCY: Latency = Latency { mean_s: 0.1, sd_s: 0.1 };
+    const LATENCY: StreamLatency = StreamLatency { mean_s: 0.1, sd_s: 0.1 };
 
     fn host() -> Timestamp {
         Timestamp::from_seconds(HOST_S)

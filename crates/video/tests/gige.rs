@@ -9,7 +9,9 @@ use std::net::Ipv4Addr;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use crossfix_video::{Frame, GigeCamera, GigeOptions, Live, Pixels, Sight, TimedBy, VideoError};
+use crossfix_video::{
+    Frame, GigeCamera, GigeOptions, Live, LiveEvent, Pixels, TimedBy, VideoError,
+};
 
 use self::fake::{Behaviour, Clock, Fake};
 
@@ -70,9 +72,9 @@ fn within(live: &Live, seconds: f64) -> (Vec<Frame>, Vec<VideoError>) {
     let until = Instant::now() + Duration::from_secs_f64(seconds);
     while Instant::now() < until {
         match live.next(until.saturating_duration_since(Instant::now())) {
-            Sight::Frame(frame) => frames.push(frame),
-            Sight::Trouble(trouble) => troubles.push(trouble),
-            Sight::Nothing => {}
+            LiveEvent::Frame(frame) => frames.push(frame),
+            LiveEvent::Trouble(trouble) => troubles.push(trouble),
+            LiveEvent::Nothing => {}
         }
     }
     (frames, troubles)
@@ -189,7 +191,7 @@ fn a_camera_that_falls_silent_is_opened_anew_and_one_that_is_left_is_free() {
 fn a_camera_that_somebody_else_controls_or_that_is_not_there_is_said() {
     let camera = Fake::start(address(5), Behaviour { taken: true, ..own_clock() });
     let first = |live: Live| match live.next(Duration::from_secs(10)) {
-        Sight::Trouble(trouble) => trouble.to_string(),
+        LiveEvent::Trouble(trouble) => trouble.to_string(),
         other => panic!("{other:?}"),
     };
     let said = first(watched(&camera));
@@ -208,7 +210,7 @@ fn a_camera_that_somebody_else_controls_or_that_is_not_there_is_said() {
 }
 
 /// What comes first of a camera that describes itself wrongly: frames by what can be read of it, or trouble.
-fn first_of(last: u8, describes: fn(String) -> String) -> Sight {
+fn first_of(last: u8, describes: fn(String) -> String) -> LiveEvent {
     let camera = Fake::start(address(last), Behaviour { describes, ..own_clock() });
     watched(&camera).next(Duration::from_secs(10))
 }
@@ -216,14 +218,14 @@ fn first_of(last: u8, describes: fn(String) -> String) -> Sight {
 #[test]
 fn a_camera_whose_width_is_its_width_is_trouble() {
     let sight = first_of(7, |right| right.replace("<pValue>WidthReg<", "<pValue>Width<"));
-    assert!(matches!(sight, Sight::Trouble(_)), "{sight:?}");
+    assert!(matches!(sight, LiveEvent::Trouble(_)), "{sight:?}");
 }
 
 #[test]
 fn a_camera_whose_payload_is_a_sum_of_itself_is_survived() {
     let sight =
         first_of(8, |right| right.replace(">WidthReg</pVariable>", ">PayloadSize</pVariable>"));
-    assert!(!matches!(sight, Sight::Nothing), "{sight:?}");
+    assert!(!matches!(sight, LiveEvent::Nothing), "{sight:?}");
 }
 
 #[test]
@@ -231,7 +233,7 @@ fn a_camera_whose_formula_has_brackets_without_end_is_survived() {
     let sight = first_of(9, |right| {
         right.replace("W*H", &format!("{}W*H{}", "(".repeat(100_000), ")".repeat(100_000)))
     });
-    assert!(!matches!(sight, Sight::Nothing), "{sight:?}");
+    assert!(!matches!(sight, LiveEvent::Nothing), "{sight:?}");
 }
 
 #[test]
@@ -240,13 +242,13 @@ fn a_camera_that_describes_groups_within_groups_is_survived() {
         let group = "<Group Comment=\"a\">".repeat(50_000) + &"</Group>".repeat(50_000);
         right.replace("<Port ", &(group + "<Port "))
     });
-    assert!(!matches!(sight, Sight::Nothing), "{sight:?}");
+    assert!(!matches!(sight, LiveEvent::Nothing), "{sight:?}");
 }
 
 #[test]
 fn a_camera_whose_description_breaks_off_is_trouble() {
     let sight = first_of(11, |right| right[..right.len() / 2].to_owned());
-    assert!(matches!(sight, Sight::Trouble(_)), "{sight:?}");
+    assert!(matches!(sight, LiveEvent::Trouble(_)), "{sight:?}");
 }
 
 /// What was wrong is said, and another program may have the camera at once.
@@ -255,7 +257,9 @@ fn a_camera_that_cannot_be_set_up_is_given_back() {
     let describes = |right: String| right.replace("Mono8", "Mono12");
     let camera = Fake::start(address(13), Behaviour { describes, ..own_clock() });
     let live = watched(&camera);
-    let Sight::Trouble(trouble) = live.next(Duration::from_secs(10)) else { panic!("no trouble") };
+    let LiveEvent::Trouble(trouble) = live.next(Duration::from_secs(10)) else {
+        panic!("no trouble")
+    };
     assert!(trouble.to_string().contains("Mono8"), "{trouble}");
     drop(live);
     let until = Instant::now() + Duration::from_secs(2);
@@ -279,5 +283,5 @@ fn a_camera_whose_formula_and_references_are_deep_is_survived() {
             .replace("<pValue>WidthReg<", "<pValue>N1<")
             .replace("<Port ", &format!("{chain}{last}<Port "))
     });
-    assert!(matches!(sight, Sight::Frame(_)), "{sight:?}");
+    assert!(matches!(sight, LiveEvent::Frame(_)), "{sight:?}");
 }

@@ -10,8 +10,9 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crossfix_message::Timestamp;
 use crossfix_video::{
-    CaptureTime, Frame, FrameSource, H264Encoder, Latency, Live, Login, Mount, Pixels, RtspCamera,
-    RtspOptions, RtspServer, RtspTransport, Sight, StreamAddress, TimedBy, VideoError,
+    CaptureTime, Frame, FrameSource, H264Encoder, Live, LiveEvent, Login, Pixels, RtspCamera,
+    RtspOptions, RtspServer, RtspTransport, ServedStream, StreamAddress, StreamLatency, TimedBy,
+    VideoError,
 };
 
 const WIDTH: usize = 320;
@@ -59,7 +60,7 @@ impl Camera {
     fn start(
         login: Option<Login>,
         rate_hz: f64,
-        mut each: impl FnMut(&Mount, u64, Timestamp) -> bool + Send + 'static,
+        mut each: impl FnMut(&ServedStream, u64, Timestamp) -> bool + Send + 'static,
     ) -> Self {
         let mut server = RtspServer::bind("127.0.0.1:0".parse().unwrap(), login).unwrap();
         let mount = server.mount("north");
@@ -100,7 +101,7 @@ impl Camera {
             login: None,
             transport: RtspTransport::Tcp,
             heeds_reports: true,
-            latency: Latency::default(),
+            latency: StreamLatency::default(),
         }
     }
 
@@ -138,9 +139,9 @@ fn within(live: &Live, seconds: f64) -> (Vec<Frame>, Vec<VideoError>) {
     let until = Instant::now() + Duration::from_secs_f64(seconds);
     while Instant::now() < until {
         match live.next(until.saturating_duration_since(Instant::now())) {
-            Sight::Frame(frame) => frames.push(frame),
-            Sight::Trouble(trouble) => troubles.push(trouble),
-            Sight::Nothing => {}
+            LiveEvent::Frame(frame) => frames.push(frame),
+            LiveEvent::Trouble(trouble) => troubles.push(trouble),
+            LiveEvent::Nothing => {}
         }
     }
     (frames, troubles)
@@ -149,7 +150,7 @@ fn within(live: &Live, seconds: f64) -> (Vec<Frame>, Vec<VideoError>) {
 /// What is said first when a camera is opened.
 fn refused(options: RtspOptions) -> String {
     match watched(options).next(Duration::from_secs(10)) {
-        Sight::Trouble(trouble) => trouble.to_string(),
+        LiveEvent::Trouble(trouble) => trouble.to_string(),
         other => panic!("{other:?}"),
     }
 }
@@ -340,7 +341,7 @@ fn who_looks_too_slowly_sees_the_newest() {
         assert!(begun.elapsed() < Duration::from_secs(10), "{:?}", live.counts());
         std::thread::sleep(Duration::from_millis(50));
     }
-    let Sight::Frame(first) = live.next(Duration::ZERO) else { panic!("nothing came") };
+    let LiveEvent::Frame(first) = live.next(Duration::ZERO) else { panic!("nothing came") };
     assert!(now().seconds_since(camera.captured(shown(&first))) < 0.3);
     assert!(live.counts().left_out > 0, "{:?}", live.counts());
 }
@@ -374,7 +375,7 @@ fn a_pipeline_is_watched_as_a_stream_is() {
             pipeline: format!("{source} ! {decoded}"),
             login: None,
             heeds_reports: true,
-            latency: Latency::default(),
+            latency: StreamLatency::default(),
         });
         Live::start(move |silence| camera.open(silence))
     };
@@ -397,7 +398,7 @@ fn a_pipeline_is_watched_as_a_stream_is() {
         ("nothing_like_it".to_owned(), "nothing_like_it"),
     ] {
         match watched(&source).next(Duration::from_secs(10)) {
-            Sight::Trouble(trouble) => {
+            LiveEvent::Trouble(trouble) => {
                 assert!(trouble.to_string().contains(says), "{trouble}");
             }
             other => panic!("{other:?}"),

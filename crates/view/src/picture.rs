@@ -4,7 +4,7 @@ use std::time::Duration;
 use crossfix_geometry::{Camera, Geodetic};
 use crossfix_message::{
     BearingFrame, Calibration, CameraCalibration, Channel, DecodeError, Health, ImageTrackState,
-    Preview, Timestamp, Track, TrackEvent, TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
+    Preview, Timestamp, Track, TrackEvent, TrackFrame, TrackState, TruthFrame, decode,
 };
 use nalgebra::{Point3, Vector3};
 use rerun::RecordingStream;
@@ -422,14 +422,7 @@ impl Picture {
 
     fn event(&mut self, event: &TrackEvent) -> Result<(), ViewError> {
         self.at(event.time_ns);
-        let what =
-            event.kind().as_str_name().trim_start_matches("TRACK_EVENT_KIND_").to_lowercase();
-        let text = match event.other_id {
-            0 => format!("track {} {what}", TrackNumber(event.track_id)),
-            other => {
-                format!("track {} {what} into {}", TrackNumber(event.track_id), TrackNumber(other))
-            }
-        };
+        let text = event.to_string();
         Ok(self.stream.log("events", &TextLog::new(text))?)
     }
 

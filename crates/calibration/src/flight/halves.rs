@@ -48,7 +48,7 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &FlightState) -> Option
     let mut ratios = vec![None; state.cameras.len()];
     for (start, &index) in apart.starts.iter().zip(&shown) {
         let noise = &priors.cameras[index].noise;
-        ratios[index] = apart.ratio(flight, state, (index, *start), noise);
+        ratios[index] = apart.ratio(flight, state, index, *start, noise);
     }
     Some(ratios)
 }
@@ -120,7 +120,8 @@ impl DifferenceOfHalves {
         &self,
         flight: &Flight<'_>,
         state: &FlightState,
-        (index, start): (usize, usize),
+        index: usize,
+        start: usize,
         noise: &LabelNoise,
     ) -> Option<f64> {
         let camera = &state.cameras[index];

@@ -218,7 +218,7 @@ pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, 
         return Err(none());
     }
     if result.is_wrong() {
-        result.suspects = suspects(picture, (best, &result), needed);
+        result.suspects = suspects(picture, best, &result, needed);
     }
     Ok(result)
 }
@@ -226,7 +226,8 @@ pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, 
 /// The landmarks without which the rest fits.
 fn suspects(
     picture: &LandmarkPicture,
-    (adjusted, result): (&AdjustedCamera, &LandmarkResult),
+    adjusted: &AdjustedCamera,
+    result: &LandmarkResult,
     needed: usize,
 ) -> Vec<String> {
     if picture.landmarks.len() <= needed {

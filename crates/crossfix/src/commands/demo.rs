@@ -13,6 +13,7 @@ use crossfix_vision::{DetectorConfig, TrackerConfig};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::commands::evaluate::{Question, evaluate, render};
+use crate::commands::numbers;
 use crate::commands::view::{EarthArgs, save_recording};
 use crate::config::{
     self, CameraFile, ClockConfig, ClockSourceName, FusionFile, MountConfig, PoseConfig,
@@ -53,7 +54,8 @@ pub struct Args {
     #[arg(long, default_value_t = 1, value_name = "N")]
     seed: u64,
     /// How long the scene lasts, seconds.
-    #[arg(long, default_value_t = 25.0, value_name = "SECONDS")]
+    #[arg(long, default_value_t = 25.0, value_name = "SECONDS", value_parser = numbers::scene_seconds,
+          allow_negative_numbers = true)]
     duration: f64,
     /// The folder to write recording, picture, configurations and logs to.
     #[arg(short, long, default_value = "demo-output", value_name = "DIR")]
@@ -82,7 +84,7 @@ struct Component {
 
 impl Component {
     /// Starts this program with a subcommand; its logs go to a file.
-    fn start(name: &str, folder: &Path, arguments: &[String]) -> anyhow::Result<Self> {
+    fn start(name: &str, folder: &Path, arguments: &[&str]) -> anyhow::Result<Self> {
         let program = std::env::current_exe().context("cannot find this program's own file")?;
         let log = folder.join("logs").join(format!("{name}.log"));
         let log = std::fs::File::create(&log)
@@ -162,11 +164,6 @@ struct Streams {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let begun = Instant::now();
-    ensure!(
-        (5.0..=3600.0).contains(&args.duration),
-        "--duration is {}: it must be from 5 to 3600 s",
-        args.duration
-    );
     let shutdown = Shutdown::listen();
     let mut scene: Scene = config::parse(SCENE, &[])?;
     if args.hand_off {
@@ -222,61 +219,23 @@ fn play(
     network: &NetworkConfig,
     shutdown: &Shutdown,
 ) -> anyhow::Result<Ending> {
-    let text = |path: &Path| path.display().to_string();
-    let start = |name: &str, arguments: &[&str]| {
-        let arguments: Vec<String> = arguments.iter().map(|a| (*a).to_owned()).collect();
-        Component::start(name, &files.folder, &arguments)
-    };
-    let (network_file, recording) = (text(&files.network), text(&files.recording));
-    let mut recorder =
-        start("recorder", &["record", "-c", &network_file, "-o", &recording, "--overwrite"])?;
-    let mut fusion = start("fusion", &["fuse", "-c", &text(&files.fusion)])?;
-    let viewer = if args.view {
-        Some(start("viewer", &["view", "-c", &text(&files.network)])?)
-    } else {
-        None
-    };
-
+    let centre = Centre::start(args, files)?;
     let link = Link::open(network, &Role::Observer)?;
     let subscription = link.subscribe(&[link.key(Channel::Tracks).to_string()])?;
     let go_on = || !shutdown.requested();
     link.wait_for(&[Channel::FusionAlive], PATIENCE, go_on)
         .context("the fusion centre did not come up")?;
-    let start_at = wall_seconds() + RUN_UP_S;
-    let begin = format!("{start_at:.6}");
-    let mut agents = Vec::new();
-    for (name, file) in &files.cameras {
-        let arguments = ["agent", "-c", &text(file), "--wait-for-recorder", "--start-at", &begin];
-        agents.push(start(name.as_str(), &arguments)?);
-    }
-    // Agents of a scene end with it; agents that watch a stream go on after it has ended.
-    let (mut players, mut watchers) = (agents, Vec::new());
-    if let Some(Streams { address, scene, truth }) = &files.streams {
-        let (scene, address, truth) = (text(scene), address.to_string(), text(truth));
-        let arguments =
-            ["simulate", &scene, "--rtsp", &address, "--start-at", &begin, "-o", &truth];
-        watchers = std::mem::replace(&mut players, vec![start("cameras", &arguments)?]);
-    }
-
+    let begins_at = wall_seconds() + RUN_UP_S;
+    let mut cameras = Cameras::start(files, begins_at)?;
     let bar = progress_bar(args.duration);
-    let mut interrupted = false;
+    let mut ending = Ending::Complete;
     let mut tracks = BTreeMap::new();
-    while !players.is_empty() {
-        let mut running = Vec::new();
-        for mut player in players {
-            if player.runs(&files.folder)? {
-                running.push(player);
-            }
-        }
-        players = running;
-        for watcher in &mut watchers {
-            watcher.runs(&files.folder)?;
-        }
+    while cameras.play(&files.folder)? {
         if shutdown.requested() {
-            interrupted = true;
+            ending = Ending::Interrupted;
             break;
         }
-        let elapsed = (wall_seconds() - start_at).clamp(0.0, args.duration);
+        let elapsed = (wall_seconds() - begins_at).clamp(0.0, args.duration);
         bar.set_position((elapsed * 10.0) as u64);
         if let Some(message) = newest(&subscription, &mut tracks) {
             bar.set_message(message);
@@ -284,7 +243,82 @@ fn play(
         std::thread::sleep(Duration::from_millis(100));
     }
     bar.finish_and_clear();
-    if interrupted {
+    stop_all(centre, cameras, ending)?;
+    drop(subscription);
+    link.close(LEAVE)?;
+    Ok(ending)
+}
+
+/// What hears the cameras.
+struct Centre {
+    recorder: Component,
+    fusion: Component,
+    viewer: Option<Component>,
+}
+
+impl Centre {
+    fn start(args: &Args, files: &DemoFiles) -> anyhow::Result<Self> {
+        let start =
+            |name: &str, arguments: &[&str]| Component::start(name, &files.folder, arguments);
+        let (network, recording) = (text(&files.network), text(&files.recording));
+        let record = ["record", "-c", &network, "-o", &recording, "--overwrite"];
+        let view = ["view", "-c", &network];
+        Ok(Self {
+            recorder: start("recorder", &record)?,
+            fusion: start("fusion", &["fuse", "-c", &text(&files.fusion)])?,
+            viewer: args.view.then(|| start("viewer", &view)).transpose()?,
+        })
+    }
+}
+
+/// The processes that stand for the cameras.
+struct Cameras {
+    /// They end with the scene: its agents, or the cameras whose streams agents watch.
+    players: Vec<Component>,
+    /// Agents that watch a stream: they go on after it has ended.
+    watchers: Vec<Component>,
+}
+
+impl Cameras {
+    fn start(files: &DemoFiles, begins_at: f64) -> anyhow::Result<Self> {
+        let begin = format!("{begins_at:.6}");
+        let mut agents = Vec::new();
+        for (name, file) in &files.cameras {
+            let arguments =
+                ["agent", "-c", &text(file), "--wait-for-recorder", "--start-at", &begin];
+            agents.push(Component::start(name.as_str(), &files.folder, &arguments)?);
+        }
+        let Some(Streams { address, scene, truth }) = &files.streams else {
+            return Ok(Self { players: agents, watchers: Vec::new() });
+        };
+        let (scene, address, truth) = (text(scene), address.to_string(), text(truth));
+        let arguments =
+            ["simulate", &scene, "--rtsp", &address, "--start-at", &begin, "-o", &truth];
+        let streams = Component::start("cameras", &files.folder, &arguments)?;
+        Ok(Self { players: vec![streams], watchers: agents })
+    }
+
+    /// Whether the scene goes on; an error if a process has failed.
+    fn play(&mut self, folder: &Path) -> anyhow::Result<bool> {
+        for watcher in &mut self.watchers {
+            watcher.runs(folder)?;
+        }
+        let mut running = Vec::new();
+        for mut player in std::mem::take(&mut self.players) {
+            if player.runs(folder)? {
+                running.push(player);
+            }
+        }
+        self.players = running;
+        Ok(!self.players.is_empty())
+    }
+}
+
+/// Stops all components, those that send first.
+fn stop_all(centre: Centre, cameras: Cameras, ending: Ending) -> anyhow::Result<()> {
+    let Centre { mut recorder, mut fusion, viewer } = centre;
+    let Cameras { mut players, mut watchers } = cameras;
+    if ending == Ending::Interrupted {
         // All are asked at once, as one that is asked to stop waits for no other.
         players.iter_mut().chain([&mut fusion, &mut recorder]).for_each(Component::ask_to_stop);
     }
@@ -299,9 +333,11 @@ fn play(
     {
         tracing::warn!("no live view: {error}");
     }
-    drop(subscription);
-    link.close(LEAVE)?;
-    Ok(if interrupted { Ending::Interrupted } else { Ending::Complete })
+    Ok(())
+}
+
+fn text(path: &Path) -> String {
+    path.display().to_string()
 }
 
 fn progress_bar(duration: f64) -> ProgressBar {

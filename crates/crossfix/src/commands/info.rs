@@ -23,7 +23,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     } else {
         print(&info);
     }
-    ensure!(!info.channels.is_empty(), "{} holds no message of Crossfix", args.recording.display());
+    let messages: u64 = info.channels.iter().map(|channel| channel.messages).sum();
+    ensure!(messages > 0, "{} holds no message of Crossfix", args.recording.display());
+    ensure!(
+        messages > info.newer,
+        "none of {messages} messages of {} can be read: they are of a newer version",
+        args.recording.display()
+    );
     Ok(())
 }
 
@@ -44,6 +50,9 @@ fn print(info: &RecordingInfo) {
     output::line(output::table(&rows));
     if info.foreign > 0 {
         output::line(format!("{} messages in other schemas, such as Foxglove's", info.foreign));
+    }
+    if info.newer > 0 {
+        output::line(format!("{} messages are of a newer version: update this side", info.newer));
     }
     if let Some(source) = &info.source {
         let Source { command, version, run, host } = source;

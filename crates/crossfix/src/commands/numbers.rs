@@ -3,16 +3,17 @@
 /// Latest time accepted, seconds since the Unix epoch: the end of this century. The earliest is 0,
 /// at which simulations begin. With half of it times after 2034 would be refused.
 const LAST_WALL_TIME: f64 = 4_102_444_800.0;
-/// Highest playing speed: a day takes a minute and a half. With half of it one of three minutes
-/// would be the shortest.
+/// Lowest and highest playing speed: a second takes a minute and a half, and a day as long. With
+/// half of the highest a day would take three minutes.
+const LEAST_SPEED: f64 = 0.01;
 const MOST_SPEED: f64 = 1000.0;
 
-pub fn number(text: &str) -> Result<f64, String> {
+fn number(text: &str) -> Result<f64, String> {
     let number: f64 = text.trim().parse().map_err(|_| format!("`{text}` is no number"))?;
     if number.is_finite() { Ok(number) } else { Err(format!("`{text}` is not finite")) }
 }
 
-fn within(text: &str, least: f64, most: f64, unit: &str) -> Result<f64, String> {
+pub fn within(text: &str, least: f64, most: f64, unit: &str) -> Result<f64, String> {
     let number = number(text)?;
     if (least..=most).contains(&number) {
         Ok(number)
@@ -21,19 +22,79 @@ fn within(text: &str, least: f64, most: f64, unit: &str) -> Result<f64, String> 
     }
 }
 
-pub fn positive(text: &str) -> Result<f64, String> {
-    number(text)
-        .and_then(|n| if n > 0.0 { Ok(n) } else { Err("it must be more than 0".to_owned()) })
-}
-
-pub fn not_negative(text: &str) -> Result<f64, String> {
-    number(text)
-        .and_then(|n| if n >= 0.0 { Ok(n) } else { Err("it must not be negative".to_owned()) })
-}
-
 /// Speed relative to real time; 0 is as fast as possible.
 pub fn speed(text: &str) -> Result<f64, String> {
-    within(text, 0.0, MOST_SPEED, "")
+    let number = number(text)?;
+    if number == 0.0 || (LEAST_SPEED..=MOST_SPEED).contains(&number) {
+        Ok(number)
+    } else {
+        Err(format!("it must be 0, or from {LEAST_SPEED} to {MOST_SPEED}"))
+    }
+}
+
+/// A distance on a site, metres.
+pub fn distance(text: &str) -> Result<f64, String> {
+    within(text, 0.01, 100_000.0, " m")
+}
+
+/// A standard deviation of places, metres: at best a tenth of a millimetre.
+pub fn some_metres(text: &str) -> Result<f64, String> {
+    within(text, 1e-4, 1000.0, " m")
+}
+
+/// A size or a standard deviation of places, metres; 0 is none.
+pub fn metres(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 1000.0, " m")
+}
+
+/// A difference of heights, metres: the sea is within 110 m of the ellipsoid everywhere.
+pub fn height_difference(text: &str) -> Result<f64, String> {
+    within(text, -200.0, 200.0, " m")
+}
+
+/// A length or a standard deviation in an image, pixels.
+pub fn pixels(text: &str) -> Result<f64, String> {
+    within(text, 0.01, 1000.0, " px")
+}
+
+/// A standard deviation of a rotation, degrees.
+pub fn degrees(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 90.0, " degrees")
+}
+
+/// A speed or a standard deviation of velocities, metres per second.
+pub fn metres_per_second(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 10_000.0, " m/s")
+}
+
+/// How long a simulated scene lasts, seconds.
+pub fn scene_seconds(text: &str) -> Result<f64, String> {
+    within(text, 5.0, 3600.0, " s")
+}
+
+/// How long states of a track wait for later bearings, seconds.
+pub fn lag(text: &str) -> Result<f64, String> {
+    within(text, 0.001, 2.0, " s")
+}
+
+/// How long a file or a part of it lasts, minutes.
+pub fn minutes(text: &str) -> Result<f64, String> {
+    within(text, 0.01, 100_000.0, " minutes")
+}
+
+/// A time after the beginning of a recording, seconds: at most three years.
+pub fn seconds(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 1e8, " s")
+}
+
+/// Size of a file, MB.
+pub fn megabytes(text: &str) -> Result<f64, String> {
+    within(text, 0.1, 1e9, " MB")
+}
+
+/// Space on a disk, GB.
+pub fn gigabytes(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 1e9, " GB")
 }
 
 /// Seconds since the Unix epoch.
@@ -99,11 +160,16 @@ mod tests {
 
     #[test]
     fn what_is_out_of_range_is_refused_with_its_range() {
-        assert!(positive("0").is_err() && not_negative("0").is_ok() && not_negative("-1").is_err());
-        for bad in ["nan", "inf", "-1", "1e300", "fast"] {
-            assert!(speed(bad).is_err() && wall_time(bad).is_err() && rate(bad).is_err(), "{bad}");
+        assert!(distance("0").is_err() && metres("0").is_ok() && metres("-1").is_err());
+        for bad in ["nan", "inf", "-1000", "1e300", "fast"] {
+            let ranges =
+                [speed, distance, metres, height_difference, pixels, degrees, lag, minutes];
+            let more = [metres_per_second, seconds, megabytes, gigabytes, wall_time, rate];
+            assert!(ranges.iter().chain(&more).all(|range| range(bad).is_err()), "{bad}");
         }
-        assert_eq!(speed("-1").unwrap_err(), "it must be from 0 to 1000");
+        for bad in ["-1", "1e-300", "1001"] {
+            assert_eq!(speed(bad).unwrap_err(), "it must be 0, or from 0.01 to 1000");
+        }
         assert_eq!(speed("0"), Ok(0.0));
     }
 }

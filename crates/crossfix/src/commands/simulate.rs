@@ -52,7 +52,8 @@ pub struct Args {
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
     /// Standard deviation of a bearing in the recording, pixels per axis.
-    #[arg(long, default_value_t = 0.3, value_name = "PIXELS")]
+    #[arg(long, default_value_t = 0.3, value_name = "PIXELS", value_parser = numbers::pixels,
+          allow_negative_numbers = true)]
     noise_px: f64,
     /// Override a key of the scene, e.g. duration_s=10.
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -69,7 +70,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if let Some(folder) = &args.scenario {
         let site =
             args.site.site().build().context("the site that the options describe is impossible")?;
-        let exposures = scenario::write(&site, folder)?;
+        let exposures = scenario::write(&site, folder, &Shutdown::listen())?;
         output::line(format!("{exposures} exposures written to {}", folder.display()));
     }
     args.scene.as_ref().map_or(Ok(()), |scene| simulate(args, scene))
@@ -80,10 +81,6 @@ fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
     let world =
         scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
     let noise = args.noise_px;
-    ensure!(
-        (0.01..100.0).contains(&noise),
-        "--noise-px is {noise}: it must be from 0.01 to 100 px"
-    );
     let begins = match (args.rtsp, args.start_at) {
         (Some(_), Some(wall_s)) => Timestamp::from_seconds(wall_s),
         (Some(_), None) => Timestamp::from_seconds(wall_seconds() + live::RUN_UP_S),
@@ -94,16 +91,7 @@ fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
         output::line(format!("{messages} messages written to {}", path.display()));
     }
     if let Some(folder) = &args.video {
-        std::fs::create_dir_all(folder)
-            .with_context(|| format!("cannot make {}", folder.display()))?;
-        for camera in world.cameras() {
-            let path = folder.join(format!("{}.y4m", camera.name()));
-            let draft = Draft::new(&path, &[])?;
-            film(camera, draft.path())
-                .with_context(|| format!("cannot write {}", path.display()))?;
-            draft.keep()?;
-            output::line(format!("{} frames written to {}", camera.frames(), path.display()));
-        }
+        film(&world, folder)?;
     }
     if let Some(address) = args.rtsp {
         live::play(&world, address, begins, &Shutdown::listen().with_stdin(args.stop_with_stdin))?;
@@ -198,7 +186,22 @@ fn exposure(
 }
 
 /// A camera's rendered frames as Y4M, brightness only.
-fn film(camera: &SimulatedCamera, path: &Path) -> anyhow::Result<()> {
+/// Writes a video of each camera to a folder; what is not complete is removed again.
+fn film(world: &World, folder: &Path) -> anyhow::Result<()> {
+    let shutdown = Shutdown::listen();
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    for camera in world.cameras() {
+        let path = folder.join(format!("{}.y4m", camera.name()));
+        let draft = Draft::new(&path, &[])?;
+        film_camera(camera, draft.path(), &shutdown)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+        draft.keep()?;
+        output::line(format!("{} frames written to {}", camera.frames(), path.display()));
+    }
+    Ok(())
+}
+
+fn film_camera(camera: &SimulatedCamera, path: &Path, shutdown: &Shutdown) -> anyhow::Result<()> {
     let mut file = BufWriter::new(std::fs::File::create(path)?);
     let description = camera.description();
     let [width, height] = description.size_px;
@@ -206,6 +209,7 @@ fn film(camera: &SimulatedCamera, path: &Path) -> anyhow::Result<()> {
     let millihertz = (description.rate_hz * 1000.0).round() as u64;
     writeln!(file, "YUV4MPEG2 W{width} H{height} F{millihertz}:1000 Ip A1:1 Cmono")?;
     for index in 0..camera.frames() {
+        ensure!(!shutdown.requested(), "asked to stop");
         writeln!(file, "FRAME")?;
         file.write_all(&camera.frame(index).brightness)?;
     }

@@ -3,8 +3,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail, ensure};
 use crossfix_video::{
-    Frame, GigeCamera, GigeOptions, Latency, Live, LiveCamera, RtspCamera, RtspOptions,
-    RtspTransport, Sight, StreamAddress, TimedBy, UsbCamera, UsbOptions, gige_cameras, usb_cameras,
+    Frame, GigeCamera, GigeOptions, Live, LiveCamera, LiveEvent, RtspCamera, RtspOptions,
+    RtspTransport, StreamAddress, StreamLatency, TimedBy, UsbCamera, UsbOptions, gige_cameras,
+    usb_cameras,
 };
 use serde::Serialize;
 
@@ -62,7 +63,7 @@ pub struct Args {
     #[arg(long, value_name = "SIZE", value_parser = size, conflicts_with = "config")]
     size: Option<[u32; 2]>,
     /// How long it is watched, s: cameras say what their clock shows every few seconds.
-    #[arg(long, default_value_t = 8.0, value_name = "SECONDS", value_parser = numbers::positive)]
+    #[arg(long, default_value_t = 8.0, value_name = "SECONDS", value_parser = numbers::seconds_of_an_hour)]
     seconds: f64,
     /// The file to write its last image to (JPEG).
     #[arg(long, value_name = "FILE")]
@@ -184,13 +185,13 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
             size,
             rate_hz: None,
             latency_s: None,
-            sd_s: Latency::default().sd_s,
+            sd_s: StreamLatency::default().sd_s,
         };
         return Ok(Some(LiveCamera::Usb(UsbCamera::new(options))));
     }
     if let Some(address) = address.strip_prefix("gige://") {
         let address = address.parse().with_context(|| format!("`{address}` is no address"))?;
-        let sd_s = Latency::default().sd_s;
+        let sd_s = StreamLatency::default().sd_s;
         let options = GigeOptions {
             address,
             size: args.size,
@@ -209,7 +210,7 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
     );
     let login = in_address.or(login);
     let transport = if args.udp { RtspTransport::Udp } else { RtspTransport::Tcp };
-    let latency = Latency::default();
+    let latency = StreamLatency::default();
     let options = RtspOptions { address, login, transport, heeds_reports: true, latency };
     Ok(Some(LiveCamera::Stream(RtspCamera::new(options))))
 }
@@ -288,18 +289,18 @@ pub fn try_out(camera: LiveCamera, seconds: f64) -> (Tried, Option<Frame>) {
     let mut delays_s = Vec::new();
     while begun.elapsed().as_secs_f64() < seconds && !shutdown.requested() {
         match live.next(POLL) {
-            Sight::Frame(frame) => {
+            LiveEvent::Frame(frame) => {
                 delays_s.extend(tried.see(&frame, last.as_ref(), begun));
                 last = Some(frame);
             }
-            Sight::Trouble(trouble) => {
+            LiveEvent::Trouble(trouble) => {
                 tried.bad_frames += u64::from(trouble.is_one_frame());
                 let trouble = trouble.to_string();
                 if !tried.troubles.contains(&trouble) && tried.troubles.len() < MOST_TROUBLES {
                     tried.troubles.push(trouble);
                 }
             }
-            Sight::Nothing => {}
+            LiveEvent::Nothing => {}
         }
     }
     tried.left_out = live.counts().left_out;

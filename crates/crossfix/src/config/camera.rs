@@ -7,7 +7,7 @@ use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Time
 #[cfg(feature = "centre")]
 use crossfix_simulation::{Scene, SceneCamera};
 use crossfix_video::{
-    FrameClock, GigeCamera, GigeOptions, GstreamerCamera, Latency, LiveCamera, RtspCamera,
+    FrameClock, GigeCamera, GigeOptions, GstreamerCamera, LiveCamera, RtspCamera, StreamLatency,
     UsbCamera, UsbOptions,
 };
 use crossfix_vision::{DetectorConfig, PixelBox, TrackerConfig};
@@ -374,7 +374,7 @@ impl CameraFile {
     fn usual_clock(&self) -> (ClockSourceName, f64) {
         match self.source {
             SourceConfig::Stream(_) | SourceConfig::Gstreamer(_) => {
-                (ClockSourceName::Camera, Latency::default().sd_s)
+                (ClockSourceName::Camera, StreamLatency::default().sd_s)
             }
             SourceConfig::Usb { .. } => (ClockSourceName::Host, USB_CLOCK_SD_S),
             SourceConfig::Gige { .. } => (ClockSourceName::Host, GIGE_CLOCK_SD_S),

@@ -1,7 +1,9 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, bail, ensure};
-use crossfix_video::{GstreamerOptions, Latency, Login, RtspOptions, RtspTransport, StreamAddress};
+use crossfix_video::{
+    GstreamerOptions, Login, RtspOptions, RtspTransport, StreamAddress, StreamLatency,
+};
 use serde::{Deserialize, Serialize, Serializer};
 
 /// The live stream of a network camera.
@@ -43,7 +45,7 @@ pub enum StreamTransport {
 }
 
 fn usual_latency_s() -> f64 {
-    Latency::default().mean_s
+    StreamLatency::default().mean_s
 }
 
 impl From<String> for StreamUrl {
@@ -95,9 +97,9 @@ impl StreamConfig {
                 StreamTransport::Udp => RtspTransport::Udp,
             },
             heeds_reports: by_arrival_sd_s.is_none(),
-            latency: Latency {
+            latency: StreamLatency {
                 mean_s: self.latency_s,
-                sd_s: by_arrival_sd_s.unwrap_or(Latency::default().sd_s),
+                sd_s: by_arrival_sd_s.unwrap_or(StreamLatency::default().sd_s),
             },
         })
     }
@@ -191,9 +193,9 @@ impl GstreamerConfig {
             pipeline: self.pipeline.clone(),
             login: login("source.", self.user.as_deref(), self.password_file.as_deref())?,
             heeds_reports: by_arrival_sd_s.is_none(),
-            latency: Latency {
+            latency: StreamLatency {
                 mean_s: self.latency_s,
-                sd_s: by_arrival_sd_s.unwrap_or(Latency::default().sd_s),
+                sd_s: by_arrival_sd_s.unwrap_or(StreamLatency::default().sd_s),
             },
         })
     }

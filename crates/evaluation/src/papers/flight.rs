@@ -74,7 +74,8 @@ impl Canvas {
         &mut self,
         stamp: Option<&Stamp>,
         at: [f64; 2],
-        (strength, light): (f32, f32),
+        strength: f32,
+        light: f32,
         sigma_n: f64,
         noise: &mut Noise,
     ) -> &Plane {

@@ -67,7 +67,7 @@ fn fly(
         // Hidden for ten frames, twice.
         let hidden = scene.occlusion && (30..40).contains(&(frame % 45));
         let stamp = stamps.get(if scene.turn { frame } else { 0 }).filter(|_| !hidden);
-        let image = canvas.paint(stamp, truth, (strength, level), SIGMA_N, &mut noise);
+        let image = canvas.paint(stamp, truth, strength, level, SIGMA_N, &mut noise);
         if let Some(outcome) = follower.step(image, truth, [0.0; 2], &mut noise)
             && !hidden
         {

@@ -56,7 +56,7 @@ fn kept(
         let mut canvas = Canvas::new(sides);
         let Some(mut follower) = PaperFollower::new(config.clone(), sides) else { return 0 };
         for (frame, place) in path.iter().enumerate() {
-            let image = canvas.paint(Some(stamp), *place, (1.0, 0.0), sigma_n, &mut noise);
+            let image = canvas.paint(Some(stamp), *place, 1.0, 0.0, sigma_n, &mut noise);
             let off = follower
                 .step(image, *place, [0.0; 2], &mut noise)
                 .map_or([0.0; 2], |outcome| outcome.prediction);

@@ -68,7 +68,7 @@ fn outcomes(
         let mut follower = PaperFollower::new(config.clone(), sides)?;
         let mut outcomes = Vec::new();
         for (frame, place) in path.iter().enumerate() {
-            let image = canvas.paint(Some(&stamp), *place, (1.0, 0.0), sigma_n, &mut noise);
+            let image = canvas.paint(Some(&stamp), *place, 1.0, 0.0, sigma_n, &mut noise);
             // The velocity at the end of the tact: the difference of places is the mean over the
             // tact.
             let velocity = velocity_at(&path, frame);

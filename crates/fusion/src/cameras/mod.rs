@@ -46,7 +46,7 @@ pub(crate) use noise::{LASTING_S, RecentBearings, ThirdDifferences};
 pub(crate) use pointing::Pointed;
 pub(crate) use pose_scale::ScaleSample;
 pub(crate) use rooted::Rooted;
-pub use standing::CameraStanding;
+pub use standing::CameraTrust;
 pub(crate) use standing::{Fitting, Fittings};
 pub use watch::PoseFinding;
 
@@ -150,13 +150,13 @@ impl CameraState {
     }
 
     /// How far the camera is believed.
-    pub(crate) fn standing(&self) -> CameraStanding {
+    pub(crate) fn standing(&self) -> CameraTrust {
         if self.is_excluded() {
-            CameraStanding::Excluded
+            CameraTrust::Excluded
         } else if self.pose_scale.is_doubted() || self.noise_factor() > DOUBTED_NOISE {
-            CameraStanding::Doubted
+            CameraTrust::Doubted
         } else {
-            CameraStanding::Good
+            CameraTrust::Good
         }
     }
 
@@ -215,7 +215,8 @@ impl CameraState {
     pub(crate) fn learn_noise(
         &mut self,
         time: Timestamp,
-        (third_differences, unassigned): (&[ThirdDifferences], usize),
+        third_differences: &[ThirdDifferences],
+        unassigned: usize,
         holding_s: f64,
     ) {
         third_differences.iter().for_each(|differences| self.noise.see(differences));
@@ -224,7 +225,7 @@ impl CameraState {
 
     /// Takes in whether a frame came in time (one that was refused says nothing else); returns the
     /// new standing if that has changed.
-    pub(crate) fn note_time(&mut self, time: Timestamp, in_time: bool) -> Option<CameraStanding> {
+    pub(crate) fn note_time(&mut self, time: Timestamp, in_time: bool) -> Option<CameraTrust> {
         let fitting = if in_time { Fitting::Fits } else { Fitting::Refused };
         self.punctuality.learn(time, &[fitting]);
         self.punctuality.review()
@@ -245,7 +246,7 @@ impl CameraState {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Judgement {
     /// The camera's new standing, where it has changed.
-    pub(crate) standing: Option<CameraStanding>,
+    pub(crate) standing: Option<CameraTrust>,
     /// The camera's bearings pass beside targets: its clock may be wrong.
     pub(crate) suspects_clock: bool,
 }
@@ -364,12 +365,12 @@ impl Cameras {
         camera.misfits.learn(time, &fittings.of_two);
         // By targets that only two others see nobody is accused, but the camera's clock may be
         // wrong.
-        let misfits = camera.misfits.review() == Some(CameraStanding::Excluded);
+        let misfits = camera.misfits.review() == Some(CameraTrust::Excluded);
         // After `learn`, which renews the time of the last comparison: only an exposure that says
         // nothing lets a verdict lapse.
-        let lapsed = camera.standing.lapse(time).then_some(CameraStanding::Good);
+        let lapsed = camera.standing.lapse(time).then_some(CameraTrust::Good);
         let standing = camera.standing.review().or(lapsed);
-        let excluded = standing == Some(CameraStanding::Excluded);
+        let excluded = standing == Some(CameraTrust::Excluded);
         if excluded {
             let others = self.by_name.iter_mut().filter(|(other, _)| *other != name);
             others.for_each(|(_, other)| other.standing.acquit());

@@ -80,8 +80,8 @@ impl RecentBearings {
         expected: impl Fn(Timestamp) -> Option<Unit<Vector3<f64>>>,
     ) -> ThirdDifferences {
         ThirdDifferences {
-            successive: self.successive.see(time, line, (0.0, longest_s), &expected),
-            spaced: self.spaced.see(time, line, (SPACING_S, 2.0 * SPACING_S), &expected),
+            successive: self.successive.see(time, line, 0.0, longest_s, &expected),
+            spaced: self.spaced.see(time, line, SPACING_S, 2.0 * SPACING_S, &expected),
             reported: line.covariance.trace() / 2.0,
         }
     }
@@ -99,7 +99,8 @@ impl LastThree {
         &mut self,
         time: Timestamp,
         line: &SightLine,
-        (least_s, longest_s): (f64, f64),
+        least_s: f64,
+        longest_s: f64,
         expected: impl Fn(Timestamp) -> Option<Unit<Vector3<f64>>>,
     ) -> Option<f64> {
         let [first, second, third] = self.0;

@@ -111,7 +111,7 @@ impl PoseScale {
 
     /// Takes in the squared pose error that a draw has found, and its expectation, with the typical
     /// factor of the site's cameras; returns by how much the tracks' factor changes, if it does.
-    fn learn(&mut self, (found, expected): (f64, f64), typical: f64) -> Option<f64> {
+    fn learn(&mut self, found: f64, expected: f64, typical: f64) -> Option<f64> {
         if !(found.is_finite() && expected.is_finite() && expected > 0.0) {
             return None;
         }
@@ -153,9 +153,9 @@ impl Cameras {
         };
         let typical = self.typical_scale(samples);
         let drawn = samples.iter().zip(found);
-        let changed = drawn.filter_map(|(sample, found)| {
+        let changed = drawn.filter_map(|(sample, (found, expected))| {
             let scale = &mut self.get_mut(&sample.camera)?.pose_scale;
-            Some((sample.camera.clone(), scale.learn(found, typical)?))
+            Some((sample.camera.clone(), scale.learn(found, expected, typical)?))
         });
         changed.collect()
     }

@@ -29,7 +29,7 @@ const LONGEST_STEP_S: f64 = 1.0;
 
 /// How far a camera is believed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum CameraStanding {
+pub enum CameraTrust {
     /// Its bearings are as good as it says.
     Good,
     /// Its bearings miss the targets by more than is declared of its pose: they count less.
@@ -138,7 +138,7 @@ impl Standing {
     }
 
     /// Leaves the camera out or lets it back in; returns the new standing if that has changed.
-    pub(super) fn review(&mut self) -> Option<CameraStanding> {
+    pub(super) fn review(&mut self) -> Option<CameraTrust> {
         let evidence =
             self.0.as_mut().filter(|evidence| evidence.compared_s >= LEAST_EVIDENCE_S)?;
         // Hysteresis: two limits, so that a camera between them does not come and go.
@@ -146,7 +146,7 @@ impl Standing {
         let excluded = evidence.wrong > limit;
         let changed = excluded != evidence.excluded;
         evidence.excluded = excluded;
-        let standing = if excluded { CameraStanding::Excluded } else { CameraStanding::Good };
+        let standing = if excluded { CameraTrust::Excluded } else { CameraTrust::Good };
         changed.then_some(standing)
     }
 }
@@ -156,7 +156,7 @@ mod tests {
     use super::*;
 
     /// The verdicts on a camera that gives the same evidence `rate` times per second.
-    fn verdicts(fittings: &[&[Fitting]], rate: f64) -> Vec<CameraStanding> {
+    fn verdicts(fittings: &[&[Fitting]], rate: f64) -> Vec<CameraTrust> {
         let mut standing = Standing::default();
         let mut verdicts = Vec::new();
         let mut time = Timestamp::EPOCH;
@@ -177,7 +177,7 @@ mod tests {
             assert_eq!(verdicts(&[&[Fits], &[Fits]], rate), []);
             assert_eq!(
                 verdicts(&[&[Fits], &[Beside], &[Fits]], rate),
-                [CameraStanding::Excluded, CameraStanding::Good],
+                [CameraTrust::Excluded, CameraTrust::Good],
                 "{rate} Hz"
             );
         }
@@ -190,7 +190,7 @@ mod tests {
         for k in 0..50 {
             standing.learn(at(0.1 * f64::from(k)), &[Fitting::Beside]);
         }
-        assert_eq!(standing.review(), Some(CameraStanding::Excluded));
+        assert_eq!(standing.review(), Some(CameraTrust::Excluded));
         assert!(!standing.lapse(at(9.0)));
         assert!(standing.lapse(at(10.0)));
         assert!(!standing.is_excluded() && !standing.lapse(at(20.0)));
@@ -204,7 +204,7 @@ mod tests {
             both.iter_mut().for_each(|standing| standing.learn(time, &[Fitting::Beside]));
         }
         let [mut one, mut other] = both;
-        assert_eq!(one.review(), Some(CameraStanding::Excluded));
+        assert_eq!(one.review(), Some(CameraTrust::Excluded));
         one.acquit();
         other.acquit();
         assert_eq!(other.review(), None);
@@ -218,7 +218,7 @@ mod tests {
 
     #[test]
     fn a_camera_whose_frames_are_refused_is_left_out() {
-        assert_eq!(verdicts(&[&[Fitting::Refused]], 30.0), [CameraStanding::Excluded]);
+        assert_eq!(verdicts(&[&[Fitting::Refused]], 30.0), [CameraTrust::Excluded]);
     }
 
     #[test]

@@ -8,25 +8,30 @@ use crate::cameras::LASTING_S;
 use crate::track::TrackId;
 use crate::uncertainty::CorrelatedNoise;
 
-/// Most bearings of a window: when it is full, every other one of each camera is dropped, and from
-/// then on as many of the new ones are not taken. With half of it six cameras of 30 Hz are thinned
-/// to 15 Hz, and their clocks are known 1.4 times less well.
-const MAX_SIGHTS: usize = 1500;
-/// Most cameras of a window: eight unknowns each, in time that is bounded. The others have their
-/// turn with another window. With half of it the links alone may fill a window.
-const MAX_CAMERAS: usize = 8;
-/// Most links ([`Role::Link`]) among them in the first [`ADMISSION_S`]. With twice as much they may
-/// take all places before a wanted camera is heard.
-const MAX_LINKS: usize = 4;
+/// Bounds on a window, as the time that an adjustment takes grows with it.
+struct Most {
+    /// Bearings. When it is full, every other one of each camera is dropped, and from then on every
+    /// other new one too. With half of it six cameras of 30 Hz are thinned to 15 Hz, and their
+    /// clocks are known 1.4 times less well.
+    bearings: usize,
+    /// Cameras, with eight unknowns each. The others have their turn with another window. With half
+    /// of it the links alone may fill a window.
+    cameras: usize,
+    /// Links ([`Role::Link`]) among them in the first [`ADMISSION_S`]. With twice as much they may
+    /// take all places before a wanted camera is heard.
+    links: usize,
+    /// Time of a bearing from the window's beginning, s. With half of it the same: a window is
+    /// closed after eight seconds, and no clock is off by more than two.
+    span_s: f64,
+}
+
+const MOST: Most = Most { bearings: 1500, cameras: 8, links: 4, span_s: 30.0 };
 /// After this all wanted cameras that see the target have been heard, s. With half of it a link may
 /// take the place of a wanted camera of two frames a second.
 const ADMISSION_S: f64 = 0.5;
 /// Least bearings of a camera: with fewer, what it says of its clock cannot be checked. With half
 /// of it two bearings, four numbers, are fitted by the eight unknowns of clock and pose.
 const LEAST_SIGHTS: usize = 5;
-/// Bearings farther than this from the window's beginning do not belong to it, s. With half of it
-/// the same: a window is closed after eight seconds, and no clock is off by more than two.
-const MAX_SPAN_S: f64 = 30.0;
 
 /// A bearing of a target.
 #[derive(Clone, Debug)]
@@ -105,12 +110,13 @@ impl TrackWindow {
         place: Vector3<f64>,
     ) {
         let time_s = time.seconds_since(self.start);
-        if time_s.abs() > MAX_SPAN_S {
+        if time_s.abs() > MOST.span_s {
             return;
         }
         let known = self.cameras.iter().position(|known| known == camera);
-        let no_link = self.links >= MAX_LINKS && time_s < ADMISSION_S;
-        if known.is_none() && (self.cameras.len() >= MAX_CAMERAS || (role == Role::Link && no_link))
+        let no_link = self.links >= MOST.links && time_s < ADMISSION_S;
+        if known.is_none()
+            && (self.cameras.len() >= MOST.cameras || (role == Role::Link && no_link))
         {
             return;
         }
@@ -132,7 +138,7 @@ impl TrackWindow {
             let allowance = line.covariance.trace() / alone;
             self.sights.push(WindowBearing { time_s, camera: index, line, allowance, place });
         }
-        if self.sights.len() >= MAX_SIGHTS {
+        if self.sights.len() >= MOST.bearings {
             self.thin();
         }
     }
@@ -258,7 +264,7 @@ mod tests {
             );
         }
         assert!(
-            (MAX_SIGHTS / 2..=MAX_SIGHTS).contains(&window.sights.len()),
+            (MOST.bearings / 2..=MOST.bearings).contains(&window.sights.len()),
             "{}",
             window.sights.len()
         );
@@ -290,6 +296,6 @@ mod tests {
         }
         let names: Vec<&str> = window.cameras.iter().map(CameraName::as_str).collect();
         assert_eq!(names[..6], ["00", "01", "02", "03", "14", "15"]);
-        assert_eq!(names.len(), MAX_CAMERAS, "then the others");
+        assert_eq!(names.len(), MOST.cameras, "then the others");
     }
 }

@@ -5,14 +5,17 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crate::Exposure;
 
-/// Most exposures that wait in one queue: 64 cameras of 60 Hz send 1920 within the default
-/// lateness, three of 30 Hz 5400 within the longest. With half of it the latter are released before
-/// their lateness is over.
-const MOST_EXPOSURES: usize = 6_000;
-/// Most sightings of all exposures that wait in one queue. There are two queues, so about 30 MB in
-/// all. With half of it 64 cameras of 60 Hz with more than 26 sightings each, and not 52, are no
-/// longer waited for as long as the lateness.
-const MOST_SIGHTINGS: usize = 100_000;
+/// Bounds on what waits in one queue. There are two queues, so about 30 MB in all.
+struct Most {
+    /// Exposures: 64 cameras of 60 Hz send 1920 within the default lateness, three of 30 Hz 5400
+    /// within the longest. With half of it the latter are released before their lateness is over.
+    exposures: usize,
+    /// Sightings of all of them. With half of it 64 cameras of 60 Hz with more than 26 sightings
+    /// each, and not 52, are no longer waited for as long as the lateness.
+    sightings: usize,
+}
+
+const MOST: Most = Most { exposures: 6_000, sightings: 100_000 };
 
 /// Key by which exposures are ordered: two of a camera may be corrected to the same time, and the
 /// reported times tell them apart.
@@ -73,7 +76,7 @@ impl<Note> ReorderQueue<Note> {
     /// or if more wait than is allowed.
     pub(crate) fn pop_settled(&mut self, settled: Option<Timestamp>) -> Option<(Exposure, Note)> {
         let (first, _) = self.waiting.first_key_value()?;
-        let is_crowded = self.waiting.len() > MOST_EXPOSURES || self.sightings > MOST_SIGHTINGS;
+        let is_crowded = self.waiting.len() > MOST.exposures || self.sightings > MOST.sightings;
         (is_crowded || settled.is_some_and(|settled| first.time <= settled)).then(|| self.pop())?
     }
 

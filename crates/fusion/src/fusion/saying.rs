@@ -87,7 +87,7 @@ impl Fusion {
                 .map_or([0.0; 2], |clock| [clock.offset_s, clock.relative_sd_s]);
             let clock = OwnClock { ahead_s: ahead_s + site_time.ahead_s(name), sd_s };
             let max_range_m = config.initiation.max_range_m;
-            let cues = cueing::cues(name, known, (now, clock), &targets, max_range_m);
+            let cues = cueing::cues(name, known, now, clock, &targets, max_range_m);
             outputs.push(Output::Cues(cues));
         }
     }

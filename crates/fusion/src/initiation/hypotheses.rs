@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crossfix_filter::Gate;
 use crossfix_message::{CameraName, Solver, Timestamp};
 
-use super::one_target::OneTargetTest;
+use super::one_target::{Mobility, OneTargetTest};
 use super::seeds::{Seed, SeedFinder};
 use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
@@ -14,33 +14,38 @@ use crate::cameras::Rooted;
 use crate::cameras::{Cameras, KnownCamera};
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
-use crate::track::{Track, TrackExpectation, TrackId, TrackStatus};
+use crate::track::{Track, TrackBearing, TrackExpectation, TrackId, TrackStatus};
 use crate::tracker::same_target;
 use crate::uncertainty::CameraUncertainty;
 use crate::visibility::log_missed;
 use crate::{Exposure, FusionConfig, Tracking};
 
-/// Most bearings of one exposure with which one hypothesis is continued, the best first. With one
-/// alone, a stranger (a bearing of something else) that fits better takes the target's place.
-const MAX_BRANCHES: usize = 3;
-/// Most hypotheses kept of one tree. One exposure makes at most four of each: this holds three
-/// exposures in full, half of it two.
-const MAX_FAMILY: usize = 100;
-/// Most hypotheses kept of those with the same lines in the newest period. With half of it the
-/// right past may be given up before later periods tell it apart.
-const MAX_ALIKE: usize = 20;
+/// Bounds on time and memory, however much clutter there is; the best are kept.
+struct Most {
+    /// Bearings of one exposure with which one hypothesis is continued. With one alone, a bearing
+    /// of something else that fits better takes the target's place.
+    branches: usize,
+    /// Hypotheses of one tree. One exposure makes at most four of each: this holds three exposures
+    /// in full, half of it two.
+    of_tree: usize,
+    /// Hypotheses with the same lines in the newest period. With half of it the right past may be
+    /// given up before later periods tell it apart.
+    alike: usize,
+    /// Hypotheses at a time. With half of it, in such clutter, the youngest targets go first.
+    hypotheses: usize,
+}
+
+const MOST: Most = Most { branches: 3, of_tree: 100, alike: 20, hypotheses: 6_000 };
+
 /// A hypothesis less likely than its tree's best by this log-likelihood is given up. With half of
 /// it a wrong branch that is ahead by eight can no longer be overtaken.
-const FAMILY_MARGIN: f64 = 15.0;
+const TREE_MARGIN: f64 = 15.0;
 /// A hypothesis with a smaller log-likelihood ratio than this is clutter. A seed of two cameras may
 /// begin below zero: with half of it the first misses end a new target there.
 const LEAST_SCORE: f64 = -12.0;
 /// While another explanation of the same bearings is within this log-likelihood of the best (a
 /// chance of 1 in 3000), nothing is confirmed. With half of it (1 in 50) ghosts are confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
-/// Most hypotheses at a time, the best ones: memory is bounded however much clutter there is. With
-/// half of it, in such clutter, the youngest targets go first.
-const MAX_HYPOTHESES: usize = 6_000;
 
 /// One hypothesis: that these bearings are one target's.
 #[derive(Clone, Debug)]
@@ -230,7 +235,7 @@ impl Hypotheses {
             self.extend_one(hypothesis, &context, &mut next);
         }
         self.hypotheses = next;
-        self.prune_families();
+        self.prune_trees();
     }
 
     /// Continues one hypothesis with each bearing in its gate that is likely enough compared with
@@ -253,7 +258,8 @@ impl Hypotheses {
         let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
         let prediction = hypothesis.track.expectation(
             exposure.time,
-            (&exposure.camera, known.camera.pose().position()),
+            &exposure.camera,
+            known.camera.pose().position(),
             &uncertainty,
             motion,
         );
@@ -269,10 +275,10 @@ impl Hypotheses {
         // The likeliest continuation, with a bearing or without.
         let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
         near.retain(|(ratio, _)| *ratio > miss && *ratio > best - RIVAL_MARGIN);
-        near.truncate(MAX_BRANCHES);
+        near.truncate(MOST.branches);
         let before = next.len();
-        next.extend(near.into_iter().filter_map(|way| {
-            self.continued_with(way, hypothesis.clone(), context, prediction.as_ref())
+        next.extend(near.into_iter().filter_map(|(ratio, index)| {
+            self.continued_with(index, ratio, hypothesis.clone(), context, prediction.as_ref())
         }));
         if miss <= best - RIVAL_MARGIN && next.len() > before {
             return;
@@ -286,49 +292,45 @@ impl Hypotheses {
         next.push(hypothesis);
     }
 
-    /// A hypothesis continued with a bearing, given by its log-likelihood ratio and its index.
+    /// A hypothesis continued with a bearing, given by its index and its log-likelihood ratio.
     fn continued_with(
         &self,
-        (ratio, i): (f64, usize),
+        index: usize,
+        ratio: f64,
         mut hypothesis: Hypothesis,
         context: &HypothesisContext<'_>,
         prediction: Option<&TrackExpectation>,
     ) -> Option<Hypothesis> {
         let HypothesisContext { exposure, motion, lines, uncertainty, detection, .. } = *context;
-        let (id, line) = &lines[i];
-        let time = (exposure.time, &uncertainty);
+        let (id, line) = &lines[index];
+        let bearing = TrackBearing { uncertainty: &uncertainty, ..exposure.bearing(&line.line) };
         // Taken before the update, as the prediction that the bearing is compared with.
         let density = motion.density(hypothesis.track.model_probabilities());
-        hypothesis.track.measurement_update(&exposure.camera, &line.line, time, motion)?;
+        hypothesis.track.measurement_update(bearing, motion)?;
         hypothesis.track.score += ratio;
         hypothesis.track.look(&exposure.camera, exposure.time, true, detection, motion);
         if let Some(TrackExpectation::Near(prediction)) = prediction {
-            hypothesis.one_target.see(
-                &exposure.camera,
-                (&line.line, exposure.time, exposure.uncertainty.time_sd_s),
-                prediction,
-                (density, self.speed),
-                ratio,
-            );
+            let mobility = Mobility { density, speed: self.speed };
+            hypothesis.one_target.see(&bearing, prediction, mobility, ratio);
         }
         hypothesis.lines.push((self.period, id.clone()));
-        hypothesis.rooted.insert(exposure.camera.clone(), exposure.sightings[i].rooted);
+        hypothesis.rooted.insert(exposure.camera.clone(), exposure.sightings[index].rooted);
         Some(hypothesis)
     }
 
     /// Keeps the best hypotheses of each tree.
-    fn prune_families(&mut self) {
+    fn prune_trees(&mut self) {
         self.sort();
         let mut trees: BTreeMap<u64, (f64, usize)> = BTreeMap::new();
         self.hypotheses.retain(|h| {
             let (best, count) = trees.entry(h.tree).or_insert((h.track.score, 0));
             *count += 1;
             // Sorted by score: the first of a tree is its best.
-            *count <= MAX_FAMILY
-                && h.track.score > *best - FAMILY_MARGIN
+            *count <= MOST.of_tree
+                && h.track.score > *best - TREE_MARGIN
                 && h.track.score > LEAST_SCORE
         });
-        self.hypotheses.truncate(MAX_HYPOTHESES);
+        self.hypotheses.truncate(MOST.hypotheses);
     }
 
     fn sort(&mut self) {
@@ -367,10 +369,9 @@ impl Hypotheses {
             let lines =
                 seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
             let mut one_target =
-                OneTargetTest::begin(lines, (fix.state.position(), self.speed), seed.score);
+                OneTargetTest::begin(lines, fix.state.position(), self.speed, seed.score);
             let mut rooted = BTreeMap::new();
             for ((camera, sequence, index), timed) in &seed.lines {
-                let seen_from = (camera, timed.line.origin);
                 let of = |exposure: &&&Exposure| {
                     exposure.camera == *camera && exposure.sequence == *sequence
                 };
@@ -381,7 +382,7 @@ impl Hypotheses {
                 };
                 rooted.insert(camera.clone(), own.rooted);
                 let expected = uncertainty.get(camera).and_then(|uncertainty| {
-                    track.expectation(timed.time, seen_from, uncertainty, motion)
+                    track.expectation(timed.time, camera, timed.line.origin, uncertainty, motion)
                 });
                 if let Some(TrackExpectation::Near(prediction)) = expected {
                     one_target.begin_shift(camera, &own.line, &prediction);
@@ -410,10 +411,10 @@ impl Hypotheses {
             newest.is_empty() || {
                 let count = seen.entry(newest).or_default();
                 *count += 1;
-                *count <= MAX_ALIKE
+                *count <= MOST.alike
             }
         });
-        self.hypotheses.truncate(MAX_HYPOTHESES);
+        self.hypotheses.truncate(MOST.hypotheses);
     }
 
     /// Confirms hypotheses: those of the best set without common lines that are likely enough and

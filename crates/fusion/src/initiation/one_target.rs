@@ -3,10 +3,12 @@
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
+use nalgebra::Point3;
 
 use super::sight::DirectionFilter;
 use crate::prediction::BearingPrediction;
 use crate::spatial::TYPICAL_SPEED;
+use crate::track::TrackBearing;
 use crate::visibility::independent_share;
 
 /// Logarithm of the probability that a camera never detects a target that it should see: the most
@@ -17,6 +19,15 @@ const LOG_NEVER_DETECTED: f64 = -4.6;
 /// their own, the test says nothing. With half of it clocks that are 0.7 times as uncertain let
 /// lines that cross by chance pass untested.
 const INCONCLUSIVE: f64 = 10.0;
+
+/// How a target may move.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Mobility {
+    /// Density of its acceleration, m^2/s^3.
+    pub(super) density: f64,
+    /// Standard deviation of its speed, m/s.
+    pub(super) speed: f64,
+}
 
 /// Log-likelihood ratio of all lines being one target's against every camera seeing a target of its
 /// own that no other camera sees.
@@ -40,7 +51,8 @@ impl OneTargetTest {
     /// have a speed of `speed` (m/s, standard deviation).
     pub(super) fn begin<'a>(
         lines: impl Iterator<Item = (&'a CameraName, &'a SightLine, Timestamp)>,
-        (place, speed): (nalgebra::Point3<f64>, f64),
+        place: Point3<f64>,
+        speed: f64,
         log_ratio: f64,
     ) -> Self {
         let sight = |(camera, line, time): (&CameraName, &SightLine, Timestamp)| {
@@ -88,34 +100,33 @@ impl OneTargetTest {
     /// `rate_sd` (rad/s, standard deviation).
     pub(super) fn see_first(
         &mut self,
-        camera: &CameraName,
-        (line, time): (&SightLine, Timestamp),
+        TrackBearing { camera, time, line, .. }: &TrackBearing<'_>,
         rate_sd: f64,
         first_ratio: f64,
     ) {
         self.log_ratio += first_ratio;
-        self.sights.push((camera.clone(), DirectionFilter::first(line, time, rate_sd)));
+        self.sights.push(((*camera).clone(), DirectionFilter::first(line, *time, rate_sd)));
     }
 
     /// Adds a line that continues the target as predicted. `first_ratio` is its log-likelihood
     /// ratio, which is used if it is its camera's first.
     pub(super) fn see(
         &mut self,
-        camera: &CameraName,
-        (line, time, time_sd_s): (&SightLine, Timestamp, f64),
+        bearing: &TrackBearing<'_>,
         prediction: &BearingPrediction,
-        (density, speed): (f64, f64),
+        Mobility { density, speed }: Mobility,
         first_ratio: f64,
     ) {
+        let TrackBearing { camera, time, line, uncertainty } = *bearing;
         let range = prediction.range();
         let Some((_, sight)) = self.sights.iter_mut().find(|(name, _)| name == camera) else {
-            return self.see_first(camera, (line, time), speed / range, first_ratio);
+            return self.see_first(bearing, speed / range, first_ratio);
         };
         sight.predict(time, density / range.powi(2));
         self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
         // The shift by an uncertain clock is not known before the velocity is: use a typical speed.
         // Var = (v sd(t) / r)^2 per tangent.
-        let clock = (speed * TYPICAL_SPEED * time_sd_s / range).powi(2);
+        let clock = (speed * TYPICAL_SPEED * uncertainty.time_sd_s / range).powi(2);
         self.inconclusive |= clock > INCONCLUSIVE * line.covariance.trace() / 2.0;
         sight.update(line);
     }

@@ -14,25 +14,30 @@ use crate::prediction::BearingPrediction;
 use crate::spatial::{LineId, MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::{Exposure, FusionConfig, Initiation};
 
-/// Most lines of one camera that are tried as an addition to a pair, the best first. With half of
-/// it a camera whose line of the target is the third best is left out of its seed.
-const MAX_BRANCHES: usize = 5;
+/// Bounds on time and memory in one period, however much clutter there is.
+struct Most {
+    /// Lines of one camera that are tried as an addition to a pair, the best first. With half of it
+    /// a camera whose line of the target is the third best is left out of its seed.
+    branches: usize,
+    /// Pairs of closely passing lines that are extended. Beyond it the pairs of cameras that look
+    /// most nearly along one line are left out; with half of it that happens with fewer bearings.
+    close_pairs: usize,
+    /// Seeds after which no more pairs are tried: if many bearings are alike, every combination of
+    /// them is as good as any other. Half of it is still five times as many as are kept.
+    found: usize,
+    /// Seeds that are kept, the likeliest ones. With half of it a target of the less likely half
+    /// waits for the next period.
+    kept: usize,
+}
+
+const MOST: Most = Most { branches: 5, close_pairs: 20_000, found: 20_000, kept: 2_000 };
+
 /// Lines that are part of a set of at least this many cameras need not be tried in other sets. With
 /// half of it two lines that cross by chance keep the true set from being tried.
 const SETTLED_CAMERAS: usize = 4;
-/// Most seeds kept of one period, the likeliest ones: memory is bounded however much clutter there
-/// is. With half of it a target of the less likely half waits for the next period.
-const MAX_SEEDS: usize = 2_000;
 /// The set gates are computed for sets of fewer cameras than this; larger sets pass. With half of
 /// it sets of 32 cameras pass whatever their residuals are.
-const MAX_CAMERAS: usize = 64;
-/// Most pairs of closely passing lines that are extended in one period: time is bounded. Beyond it
-/// the pairs of cameras that look most nearly along one line are left out; with half of it that
-/// happens with fewer bearings.
-const MAX_CLOSE_PAIRS: usize = 20_000;
-/// Once more seeds than this have been found, no more pairs are tried: if many bearings are alike,
-/// every combination of them is as good as any other. Half of it is still five times [`MAX_SEEDS`].
-const MAX_FOUND: usize = 20_000;
+const GATED_CAMERAS: usize = 64;
 /// Up to this distance from the nearest camera new targets are as dense as `birth_density_per_m3`
 /// says, m: at a kilometre a small drone is one pixel of an ordinary camera (0.5 mrad). Beyond it
 /// the density of those that are seen falls with the cube of the distance, so that each factor of
@@ -86,7 +91,7 @@ impl SeedFinder {
         let line_gate = Gate::with_probability(initiation.spatial_gate_probability);
         // 2 n coordinates and three terms of the velocity's prior, less six unknowns: 2 n - 3
         // degrees of freedom.
-        let set_gates = (0..MAX_CAMERAS)
+        let set_gates = (0..GATED_CAMERAS)
             .map(|n: usize| {
                 chi_square(initiation.spatial_gate_probability, (2 * n).saturating_sub(3).max(1))
             })
@@ -113,7 +118,7 @@ impl SeedFinder {
         for (a, b) in self.pairs_of_cameras(&growing) {
             for i in 0..lines[a].len() {
                 for j in 0..lines[b].len() {
-                    let enough = close > MAX_CLOSE_PAIRS || seeds.len() > MAX_FOUND;
+                    let enough = close > MOST.close_pairs || seeds.len() > MOST.found;
                     // A line on which four cameras agree needs no other set.
                     if settled[a][i] || settled[b][j] || enough {
                         continue;
@@ -160,7 +165,7 @@ impl SeedFinder {
         let agreed: BTreeSet<&LineId> =
             order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
         order.retain(|&i| names[i].len() > 2 || !names[i].iter().all(|id| agreed.contains(id)));
-        order.truncate(MAX_SEEDS);
+        order.truncate(MOST.kept);
         let mut seeds: Vec<Option<Seed>> = seeds.into_iter().map(Some).collect();
         order.into_iter().filter_map(|i| seeds[i].take()).collect()
     }
@@ -209,7 +214,7 @@ impl SeedFinder {
             let mut next = Vec::new();
             for (places, solution) in open {
                 let near = self.near(growing, &places, &solution, c);
-                let most = if branched { 1 } else { MAX_BRANCHES };
+                let most = if branched { 1 } else { MOST.branches };
                 for line in near.iter().take(most) {
                     let mut longer = places.clone();
                     longer.push((c, *line));

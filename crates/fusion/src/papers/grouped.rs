@@ -8,7 +8,7 @@ use crate::cameras::Cameras;
 use crate::initiation::{NamedLine, Start};
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
-use crate::track::Track;
+use crate::track::{Track, TrackBearing};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig};
 
@@ -70,12 +70,9 @@ fn start(group: &Group, motion: &MotionSetup) -> Option<Track> {
         .map(|((camera, ..), line)| (camera, line, CameraUncertainty::of_time(0.0)));
     let mut track = Track::start(&vague, named, motion);
     for ((camera, ..), timed) in later {
-        track.measurement_update(
-            camera,
-            &timed.line,
-            (timed.time, &CameraUncertainty::of_time(0.0)),
-            motion,
-        )?;
+        let (time, line) = (timed.time, &timed.line);
+        let uncertainty = &CameraUncertainty::of_time(0.0);
+        track.measurement_update(TrackBearing { camera, time, line, uncertainty }, motion)?;
     }
     track.solver = fix.solver;
     Some(track)

@@ -57,7 +57,8 @@ impl Track {
     pub(crate) fn expectation(
         &self,
         time: Timestamp,
-        (camera, origin): (&CameraName, Point3<f64>),
+        camera: &CameraName,
+        origin: Point3<f64>,
         uncertainty: &CameraUncertainty,
         motion: &MotionSetup,
     ) -> Option<TrackExpectation> {

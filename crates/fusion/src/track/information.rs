@@ -2,10 +2,9 @@
 //! information, without what the track believed before.
 
 use crossfix_geometry::{BearingModel, SightLine};
-use crossfix_message::CameraName;
 use nalgebra::{Matrix2, Matrix3, Matrix6, Point3};
 
-use super::Track;
+use super::{Track, TrackBearing};
 use crate::spatial::{Observability, VAGUE_VELOCITY_SD};
 use crate::uncertainty::CameraUncertainty;
 
@@ -22,14 +21,11 @@ const INFORMATION_S: f64 = 1.0;
 const POSITION_SCALE_M: f64 = 20.0;
 
 impl Track {
-    /// Adds a bearing's Fisher information to that of the recent bearings, which is carried on by
-    /// `interval` seconds to its time and faded with [`INFORMATION_S`].
-    pub(super) fn gather_information(
-        &mut self,
-        (camera, interval): (&CameraName, f64),
-        line: &SightLine,
-        uncertainty: &CameraUncertainty,
-    ) {
+    /// Adds a bearing's Fisher information to that of the recent bearings, which is carried on to
+    /// its time and faded with [`INFORMATION_S`].
+    pub(super) fn gather_information(&mut self, bearing: &TrackBearing<'_>) {
+        let TrackBearing { camera, time: now, line, uncertainty } = *bearing;
+        let interval = now.seconds_since(self.updated);
         let old = &self.information;
         let block = |row: usize, column: usize| old.fixed_view::<3, 3>(row, column).into_owned();
         let (places, ties, speeds) = (block(0, 0), block(0, 3), block(3, 3));
@@ -44,7 +40,6 @@ impl Track {
         // Old information fades by exp(-dt / T): a bearing of long ago says little of the motion
         // now.
         next *= (-interval.abs() / INFORMATION_S).exp();
-        let now = self.updated.plus_seconds(interval);
         let since_s = self.ties.get(camera).and_then(|ties| ties.silent_s(now));
         let since_s = since_s.unwrap_or(f64::INFINITY);
         let place = self.state().position();

@@ -2,10 +2,10 @@
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, SightLine};
-use crossfix_message::{CameraName, Timestamp};
+use crossfix_message::Timestamp;
 use nalgebra::Vector2;
 
-use super::Track;
+use super::{Track, TrackBearing};
 use crate::motion::{ManoeuvreDetector, MotionSetup};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
@@ -64,11 +64,11 @@ impl Track {
     fn nis(
         &self,
         innovation: &BearingInnovation,
-        interval: f64,
-        (camera, line): (&CameraName, &SightLine),
-        uncertainty: &CameraUncertainty,
+        bearing: &TrackBearing<'_>,
         motion: &MotionSetup,
     ) -> Option<f64> {
+        let TrackBearing { camera, time, line, uncertainty } = *bearing;
+        let interval = time.seconds_since(self.updated);
         let before = self.imm.predicted(interval, motion.models(self.ranged));
         let errors = self.errors_of(camera, interval);
         let against = Against { before: &before, line, uncertainty };
@@ -80,12 +80,13 @@ impl Track {
     pub(super) fn renewed(
         &self,
         innovation: &BearingInnovation,
-        interval: f64,
-        (line, errors): (&SightLine, &SharedErrors),
-        uncertainty: &CameraUncertainty,
+        bearing: &TrackBearing<'_>,
+        errors: &SharedErrors,
         motion: &MotionSetup,
     ) -> Option<SharedErrors> {
         let (anew, probability) = errors.renewed()?;
+        let TrackBearing { time, line, uncertainty, .. } = *bearing;
+        let interval = time.seconds_since(self.updated);
         let before = self.imm.predicted(interval, motion.models(self.ranged));
         let against = Against { before: &before, line, uncertainty };
         // ln of probability times normal density; the constant 2 pi is common to both cases.
@@ -101,18 +102,17 @@ impl Track {
     pub(super) fn sees_manoeuvre(
         &mut self,
         innovation: &BearingInnovation,
-        interval: f64,
-        (camera, line): (&CameraName, &SightLine),
-        uncertainty: &CameraUncertainty,
+        bearing: &TrackBearing<'_>,
         motion: &MotionSetup,
     ) -> bool {
         let nis = matches!(self.detector, Some(ManoeuvreDetector::Innovation(_)))
-            .then(|| self.nis(innovation, interval, (camera, line), uncertainty, motion))
+            .then(|| self.nis(innovation, bearing, motion))
             .flatten();
         self.detector.as_mut().is_some_and(|detector| match detector {
             ManoeuvreDetector::Residual(detector) => {
                 // In the axes of the world, so that residuals of different cameras can be averaged.
-                detector.see(innovation.model.basis * innovation.offset / line.standard_deviation())
+                let spread = bearing.line.standard_deviation();
+                detector.see(innovation.model.basis * innovation.offset / spread)
             }
             ManoeuvreDetector::Innovation(detector) => nis.is_some_and(|nis| detector.see(nis, 2)),
         })

@@ -46,14 +46,10 @@ fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
         };
         let mut track = Track::start(&fix, [], &motion);
         for timed in &lines[3..] {
-            track
-                .measurement_update(
-                    &name,
-                    &timed.line,
-                    (timed.time, &CameraUncertainty::of_time(0.0)),
-                    &motion,
-                )
-                .unwrap();
+            let (time, line) = (timed.time, &timed.line);
+            let uncertainty = &CameraUncertainty::of_time(0.0);
+            let bearing = TrackBearing { camera: &name, time, line, uncertainty };
+            track.measurement_update(bearing, &motion).unwrap();
         }
         let t = track.updated.seconds();
         let truth = Vector6::from_iterator(at(t).iter().chain(velocity.iter()).copied());
@@ -166,8 +162,13 @@ fn flown(
             timed.line.direction = Unit::new_normalize(timed.line.direction.into_inner() + off);
             timed.line.basis = tangent_basis(&timed.line.direction);
         }
-        let bearing = (timed.time, &uncertainty);
-        track.measurement_update(&names[camera], &timed.line, bearing, &motion).unwrap();
+        let bearing = TrackBearing {
+            camera: &names[camera],
+            time: timed.time,
+            line: &timed.line,
+            uncertainty: &uncertainty,
+        };
+        track.measurement_update(bearing, &motion).unwrap();
         if k == 30 {
             // Up to this bearing all errors are considered.
             track.status = status;

@@ -10,12 +10,10 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Unit, Vector2, Vector3};
 
 use super::learnt::LearntTies;
-use super::{BearingInnovation, Track};
+use super::{BearingInnovation, Track, TrackBearing};
 use crate::cameras::{ClockChange, RecentBearings, ScaleSample, ThirdDifferences};
 use crate::motion::MotionSetup;
-use crate::uncertainty::{
-    CameraUncertainty, CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies,
-};
+use crate::uncertainty::{CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies};
 use crate::update::{Told, Updated};
 use crate::visibility::Visibility;
 
@@ -99,9 +97,9 @@ impl Drawn {
     /// The sums with one bearing more.
     fn with(
         before: Option<Self>,
-        (innovation, velocity): (&BearingInnovation, Vector3<f64>),
-        line: &SightLine,
-        uncertainty: &CameraUncertainty,
+        innovation: &BearingInnovation,
+        velocity: Vector3<f64>,
+        TrackBearing { line, uncertainty, .. }: &TrackBearing<'_>,
     ) -> Self {
         let (offsets, count) =
             before.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.offsets, drawn.count));
@@ -247,33 +245,20 @@ impl Ties {
 
 impl Track {
     /// Adds a bearing of the target to the next draw.
-    pub(super) fn gather(
-        &mut self,
-        camera: &CameraName,
-        innovation: &BearingInnovation,
-        line: &SightLine,
-        uncertainty: &CameraUncertainty,
-    ) {
+    pub(super) fn gather(&mut self, bearing: &TrackBearing<'_>, innovation: &BearingInnovation) {
         let velocity = self.state().velocity();
-        if let Some(ties) = self.ties.get_mut(camera) {
-            ties.drawn = Some(Drawn::with(ties.drawn, (innovation, velocity), line, uncertainty));
+        if let Some(ties) = self.ties.get_mut(bearing.camera) {
+            ties.drawn = Some(Drawn::with(ties.drawn, innovation, velocity, bearing));
         }
     }
 
     /// Adds a bearing that passes beside the target to the next draw, for an exposure that has none
     /// of the target.
-    pub(crate) fn gather_beside(
-        &mut self,
-        camera: &CameraName,
-        (line, time): (&SightLine, Timestamp),
-        uncertainty: &CameraUncertainty,
-    ) {
+    pub(crate) fn gather_beside(&mut self, bearing: &TrackBearing<'_>) {
         let velocity = self.state().velocity();
-        if let (Some(innovation), Some(ties)) =
-            (self.innovation(time, line), self.ties.get_mut(camera))
-        {
-            let seen = (&innovation, velocity);
-            ties.beside = Some(Drawn::with(ties.beside, seen, line, uncertainty));
+        let innovation = self.innovation(bearing.time, bearing.line);
+        if let (Some(innovation), Some(ties)) = (innovation, self.ties.get_mut(bearing.camera)) {
+            ties.beside = Some(Drawn::with(ties.beside, &innovation, velocity, bearing));
         }
     }
 
@@ -373,10 +358,10 @@ impl Track {
     /// mean over the models; returns the bearing's mean squared Mahalanobis distance.
     pub(super) fn carry(
         &mut self,
-        (camera, lasting): (&CameraName, CorrelatedNoise),
-        (time, interval): (Timestamp, f64),
+        &TrackBearing { camera, time, uncertainty, .. }: &TrackBearing<'_>,
         results: &[Option<Updated>],
     ) -> f64 {
+        let lasting = uncertainty.lasting;
         // Weighted with the probabilities after the update; a model whose numbers failed has none.
         let models = results.iter().zip(self.imm.probabilities().iter().copied());
         let models = models.filter_map(|(result, weight)| Some((result.as_ref()?, weight)));
@@ -386,7 +371,7 @@ impl Track {
         // First all is predicted, then updated; the past states first, as they need the ties before
         // the update.
         self.pass_past(time);
-        self.pass(interval);
+        self.pass(time.seconds_since(self.updated));
         self.begin_to_learn(camera, lasting, time);
         self.look_back(camera, &told);
         self.learn(camera, &told);

@@ -61,13 +61,8 @@ impl Tracker {
             let column = partner.get(&row).copied();
             let taken = column.and_then(|column| {
                 let sighting = &exposure.sightings[column];
-                let time = (exposure.time, &exposure.uncertainty);
-                let taken = track.measurement_update(
-                    &exposure.camera,
-                    &sighting.line,
-                    time,
-                    &self.motion,
-                )?;
+                let bearing = exposure.bearing(&sighting.line);
+                let taken = track.measurement_update(bearing, &self.motion)?;
                 owners[column] = Some(*id);
                 Some(taken)
             });
@@ -140,7 +135,8 @@ impl Tracker {
             }
             let prediction = track.expectation(
                 exposure.time,
-                (&exposure.camera, origin),
+                &exposure.camera,
+                origin,
                 &exposure.uncertainty,
                 &self.motion,
             );
@@ -170,11 +166,7 @@ fn note_beside(track: &mut Track, exposure: &Exposure, known: &KnownCamera) {
     let away = |sighting: &Sighting| sighting.line.direction.angle(&expected);
     let beside = exposure.sightings.iter().filter(|sighting| away(sighting) < BESIDE_RAD);
     if let Some(nearest) = beside.min_by(|one, other| away(one).total_cmp(&away(other))) {
-        track.gather_beside(
-            &exposure.camera,
-            (&nearest.line, exposure.time),
-            &exposure.uncertainty,
-        );
+        track.gather_beside(&exposure.bearing(&nearest.line));
     }
 }
 

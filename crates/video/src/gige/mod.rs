@@ -19,7 +19,7 @@ use viva_genicam::{
 use self::connection::{Connection, in_words};
 use crate::stream_clock::{HostClock, StreamClock};
 use crate::{
-    Arrival, CaptureTime, Frame, FrameSource, Latency, Losses, MAX_PIXELS, Pixels, TimedBy,
+    Arrival, CaptureTime, Frame, FrameSource, Losses, MAX_PIXELS, Pixels, StreamLatency, TimedBy,
     VideoError,
 };
 
@@ -57,9 +57,9 @@ const IMPOSSIBLE: u32 = 20;
 /// if so.
 const PTP: [&str; 2] = ["PtpStatus", "GevIEEE1588Status"];
 const FOLLOWS: &str = "Slave";
-/// Latency from the exposure to the arrival where nothing better is known: an image is read out and
+/// StreamLatency from the exposure to the arrival where nothing better is known: an image is read out and
 /// sent within a frame's interval.
-const LATENCY: Latency = Latency { mean_s: 0.04, sd_s: 0.04 };
+const LATENCY: StreamLatency = StreamLatency { mean_s: 0.04, sd_s: 0.04 };
 /// Registers that every camera has, some in name only: ticks per second, the command that latches
 /// the time, and the latched time (GigE Vision 2.0, 28).
 const TICKS_AT: u64 = 0x93c;

@@ -12,7 +12,7 @@ use std::time::Duration;
 pub(crate) use self::h265::H265Decoder;
 
 use crate::stream_clock::ClockMemory;
-use crate::{FrameSource, Latency, Login, VideoError};
+use crate::{FrameSource, Login, StreamLatency, VideoError};
 
 /// A pipeline to watch, and how.
 #[derive(Clone, Debug)]
@@ -26,7 +26,7 @@ pub struct GstreamerOptions {
     /// Whether the reference time is believed; otherwise frames are timed by their arrival.
     pub heeds_reports: bool,
     /// Delay from the exposure to the arrival.
-    pub latency: Latency,
+    pub latency: StreamLatency,
 }
 
 /// A pipeline that can be started again and again.

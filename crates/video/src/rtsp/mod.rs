@@ -19,7 +19,7 @@ use retina::rtcp::{ReceivedCompoundPacket, TypedPacketRef};
 use tokio::runtime::Runtime;
 
 pub use self::address::{Login, StreamAddress};
-pub use self::server::{Mount, RtspServer};
+pub use self::server::{RtspServer, ServedStream};
 
 #[cfg(feature = "gstreamer")]
 use crate::gstreamer::H265Decoder;
@@ -75,7 +75,7 @@ pub struct RtspOptions {
     /// arrival.
     pub heeds_reports: bool,
     /// Delay from the exposure to the arrival.
-    pub latency: Latency,
+    pub latency: StreamLatency,
 }
 
 impl RtspOptions {
@@ -87,7 +87,7 @@ impl RtspOptions {
 
 /// Delay from the exposure of a frame to its arrival.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Latency {
+pub struct StreamLatency {
     /// The mean, s.
     pub mean_s: f64,
     /// Standard deviation of the latency, s. It is also used where the camera reports its clock, as
@@ -95,7 +95,7 @@ pub struct Latency {
     pub sd_s: f64,
 }
 
-impl Default for Latency {
+impl Default for StreamLatency {
     /// Typical of cameras of many makes, which take 50 to 300 ms.
     fn default() -> Self {
         Self { mean_s: 0.1, sd_s: 0.1 }

@@ -31,7 +31,7 @@ type Streams = Arc<Mutex<BTreeMap<String, Arc<Mutex<Stream>>>>>;
 
 /// Serves H.264 streams as a network camera does: RTSP, with the packets within the connection.
 ///
-/// For scenes and tests. The server does not make the pictures: the holder of a stream's [`Mount`]
+/// For scenes and tests. The server does not make the pictures: the holder of a stream's [`ServedStream`]
 /// sends each at its time.
 ///
 /// ```
@@ -51,7 +51,7 @@ pub struct RtspServer {
 
 /// A stream of a server, to send frames to.
 #[derive(Debug)]
-pub struct Mount(Arc<Mutex<Stream>>);
+pub struct ServedStream(Arc<Mutex<Stream>>);
 
 #[derive(Debug)]
 struct Stream {
@@ -98,16 +98,16 @@ impl RtspServer {
     }
 
     /// Adds a stream at a path.
-    pub fn mount(&mut self, path: &str) -> Mount {
+    pub fn mount(&mut self, path: &str) -> ServedStream {
         let source = locked(&self.streams).len() as u32 + 1;
         let packetiser = Packetiser::new(source);
         let stream = Arc::new(Mutex::new(Stream { packetiser, watchers: Vec::new() }));
         locked(&self.streams).insert(path.to_owned(), Arc::clone(&stream));
-        Mount(stream)
+        ServedStream(stream)
     }
 }
 
-impl Mount {
+impl ServedStream {
     /// Whether any client watches.
     pub fn is_watched(&self) -> bool {
         !locked(&self.0).watchers.is_empty()

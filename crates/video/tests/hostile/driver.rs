@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::Duration;
 
 use crossfix_video::{
-    FrameSource, Latency, RtspCamera, RtspOptions, RtspTransport, StreamAddress, VideoError,
+    FrameSource, RtspCamera, RtspOptions, RtspTransport, StreamAddress, StreamLatency, VideoError,
 };
 
 /// Whoever waits longer than this for what nobody sends has been forgotten.
@@ -37,7 +37,7 @@ pub fn drive(data: &[u8]) -> (usize, Option<VideoError>) {
             login,
             transport: RtspTransport::Tcp,
             heeds_reports: true,
-            latency: Latency::default(),
+            latency: StreamLatency::default(),
         });
         // If nobody has called, the camera waits for ever.
         drop(TcpStream::connect(place));

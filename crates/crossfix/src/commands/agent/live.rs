@@ -3,7 +3,9 @@
 use std::time::{Duration, Instant};
 
 use crossfix_message::{ClockSource, Timestamp};
-use crossfix_video::{Arrival, CaptureTime, Frame, Live, LiveCamera, Sight, TimedBy, VideoError};
+use crossfix_video::{
+    Arrival, CaptureTime, Frame, Live, LiveCamera, LiveEvent, TimedBy, VideoError,
+};
 use crossfix_vision::ImageTracker;
 
 use super::stream_health::StreamHealth;
@@ -72,12 +74,12 @@ impl Agent {
         let live = Live::start(move |silence| camera.open(silence));
         while !self.shutdown.requested() {
             match live.next(POLL) {
-                Sight::Frame(frame) => self.follow(&mut watch, &frame)?,
-                Sight::Trouble(trouble) => {
+                LiveEvent::Frame(frame) => self.follow(&mut watch, &frame)?,
+                LiveEvent::Trouble(trouble) => {
                     self.bad_frames += u64::from(trouble.is_one_frame());
                     self.note_trouble(&trouble);
                 }
-                Sight::Nothing => {}
+                LiveEvent::Nothing => {}
             }
             if let Some(stream) = &mut self.stream {
                 stream.note_counts(live.counts());
@@ -132,7 +134,7 @@ impl Agent {
             TimedBy::Arrival | TimedBy::ArrivalAgainstCamera { .. } => (false, frame.capture),
         };
         let time = watch.even_time(live);
-        let mut message = self.see(&mut watch.tracker, &image, (frame.index, time), capture);
+        let mut message = self.see(&mut watch.tracker, &image, frame.index, time, capture);
         if !is_by_camera {
             message.clock_source = ClockSource::Arrival.into();
         }

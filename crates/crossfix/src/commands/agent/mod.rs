@@ -338,7 +338,7 @@ impl Agent {
             let Some(image) = brightness(&frame) else {
                 continue;
             };
-            let message = self.see(&mut tracker, &image, (frame.index, capture.time), capture);
+            let message = self.see(&mut tracker, &image, frame.index, capture.time, capture);
             if !start.is_caught_up(since_s, pace.behind(since_s)) {
                 self.keep_up()?;
                 continue;

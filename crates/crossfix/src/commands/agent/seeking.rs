@@ -160,7 +160,8 @@ impl Agent {
         &mut self,
         tracker: &mut ImageTracker,
         image: &Plane,
-        (index, time): (u64, Timestamp),
+        index: u64,
+        time: Timestamp,
         capture: CaptureTime,
     ) -> BearingFrame {
         if self.seeking.as_mut().is_some_and(Seeking::point) {

@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{bail, ensure};
-use crossfix_fusion::{CameraStanding, Output};
+use crossfix_fusion::{CameraTrust, Output};
 use crossfix_message::{CameraCalibration, CameraName, Channel, Timestamp};
 use crossfix_recording::Entry;
 use serde::Serialize;
@@ -10,7 +10,7 @@ use serde::Serialize;
 use crate::centre::Centre;
 use crate::config::FusionFile;
 use crate::output;
-use crate::pose_watch::{CameraWatch, Turn};
+use crate::pose_watch::{CameraWatch, TurnText};
 use crate::recalibration::{Recalibration, Reordered};
 use crate::recorded::{self, Lacks};
 
@@ -109,8 +109,8 @@ impl CameraRecord {
         self.span = Some((first, time));
     }
 
-    fn note(&mut self, standing: CameraStanding, now: Timestamp) {
-        if standing == CameraStanding::Excluded {
+    fn note(&mut self, standing: CameraTrust, now: Timestamp) {
+        if standing == CameraTrust::Excluded {
             self.left_out_since.get_or_insert(now);
         } else if let Some(since) = self.left_out_since.take() {
             self.left_out_s += now.seconds_since(since);
@@ -228,7 +228,7 @@ impl WatchedCamera {
             seen.watch.as_ref().and_then(|watch| watch.moved_at).filter(|_| seen.has_moved);
         let (verdict, why) = match &seen.watch {
             Some(watch) if let Some(at) = watch.moved_at.filter(|_| seen.has_moved) => {
-                (CameraVerdict::Moved, format!("{}, sure at {at}: calibrate it anew", Turn(&watch.worst)))
+                (CameraVerdict::Moved, format!("{}, sure at {at}: calibrate it anew", TurnText(&watch.worst)))
             }
             _ if seen.is_apart() => (
                 CameraVerdict::Apart,

@@ -49,10 +49,10 @@ pub struct Args {
     height: LogHeight,
     /// How far the sea is above the WGS84 ellipsoid there, m, where the log does not say (with --height
     /// sea).
-    #[arg(long, value_name = "METRES", value_parser = numbers::number, allow_hyphen_values = true)]
+    #[arg(long, value_name = "METRES", value_parser = numbers::height_difference, allow_hyphen_values = true)]
     geoid: Option<f64>,
     /// How far the receiver is above what cameras see as the target's middle, m.
-    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::number, allow_hyphen_values = true)]
+    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::height_difference, allow_hyphen_values = true)]
     antenna: f64,
     /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two say how large the
     /// site is, three where it is; without a log the flight may be anybody's.
@@ -74,11 +74,11 @@ pub struct Args {
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
     log_kind: LogKind,
     /// Standard deviation of each place in the log, m per axis; the kind's without.
-    #[arg(long, value_name = "METRES", value_parser = numbers::positive)]
+    #[arg(long, value_name = "METRES", value_parser = numbers::some_metres)]
     log_sd: Option<f64>,
     /// By how much the log may lie beside as a whole, drifting over minutes, m per axis; the
     /// kind's without.
-    #[arg(long, value_name = "METRES", value_parser = numbers::not_negative)]
+    #[arg(long, value_name = "METRES", value_parser = numbers::metres)]
     log_drift: Option<f64>,
     /// Take what a camera saw from this time of its own on alone, s, as in north=151.
     #[arg(long, value_name = "CAMERA=SECONDS")]
@@ -118,8 +118,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     args.cut(&mut cameras)?;
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let landmarks = landmarks(args, &cameras)?;
-    let of = (&names[..], "the recording");
-    let surveyed = survey::read(args.positions.as_deref(), &args.distance, landmarks, of)?;
+    let positions = args.positions.as_deref();
+    let surveyed = survey::read(positions, &args.distance, landmarks, &names, "the recording")?;
     let survey = match &prior {
         Some(prior) => surveyed.clone().with_known(prior.clone()),
         None => surveyed.clone(),

@@ -68,7 +68,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     });
     let files = camera_files(&args.site)?;
     let known: Vec<CameraName> = files.iter().map(|(_, file)| file.name.clone()).collect();
-    let survey = survey::read(args.positions.as_deref(), &[], Vec::new(), (&known, "the site"))?;
+    let survey = survey::read(args.positions.as_deref(), &[], Vec::new(), &known, "the site")?;
     let (mut results, mut failed) = (Vec::new(), Vec::new());
     for (camera, landmarks) in clicked {
         let (path, file) =

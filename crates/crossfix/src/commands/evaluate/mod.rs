@@ -45,13 +45,16 @@ pub struct Question {
     #[arg(long, value_name = "FILE")]
     pub truth: Option<PathBuf>,
     /// Farther than this from a target a track is not that target's, metres.
-    #[arg(long, default_value_t = 5.0, value_name = "METRES")]
+    #[arg(long, default_value_t = 5.0, value_name = "METRES", value_parser = numbers::distance,
+          allow_negative_numbers = true)]
     pub cutoff_m: f64,
     /// Leave out what lies less than this after the first truth, seconds.
-    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::seconds,
+          allow_negative_numbers = true)]
     pub skip_s: f64,
     /// Standard deviation of the truth's places, metres per axis: what it may be off by itself.
-    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::not_negative)]
+    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::metres,
+          allow_negative_numbers = true)]
     pub truth_sd: f64,
     /// Only the instants at which so many cameras saw something: in the frame just before and in
     /// that just after.
@@ -189,9 +192,17 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
             evaluator.add(time, &targets(frame), &run.estimates(time, question.truth_sd));
         }
     }
+    let report = evaluator.report();
+    ensure!(
+        report.instants > 0,
+        "of the {} instants of the truth none is {} s after the first and seen by {} cameras",
+        times.len(),
+        question.skip_s,
+        question.min_cameras
+    );
     // Imported data arrive when they are captured, so their latency is meaningless.
     let latency = run.latency.latency().filter(|latency| latency.p99_ms > 0.0);
-    Ok(Evaluation { report: evaluator.report(), latency, lacks })
+    Ok(Evaluation { report, latency, lacks })
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {

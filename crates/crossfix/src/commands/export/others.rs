@@ -27,7 +27,7 @@ pub struct OtherFormats {
     #[arg(long, value_name = "FILE", requires = "anchor")]
     kml: Option<PathBuf>,
     /// With --kml: how high the geoid (mean sea level) is above the ellipsoid there, metres.
-    #[arg(long, value_name = "METRES", default_value_t = 0.0, value_parser = numbers::number, allow_hyphen_values = true)]
+    #[arg(long, value_name = "METRES", default_value_t = 0.0, value_parser = numbers::height_difference, allow_hyphen_values = true)]
     geoid: f64,
     /// Write events of Cursor on Target, one after the other.
     #[arg(long, value_name = "FILE", requires = "anchor")]

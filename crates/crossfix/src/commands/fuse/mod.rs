@@ -37,7 +37,7 @@ pub struct Args {
     sets: Vec<String>,
     /// Publish each state of a track once more this long after it, seconds, as the bearings since
     /// have told: on `fusion/smoothed`, beside those that go out at once.
-    #[arg(long, value_name = "SECONDS", value_parser = numbers::positive, allow_negative_numbers = true)]
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::lag, allow_negative_numbers = true)]
     lag: Option<f64>,
     #[command(flatten)]
     health: HealthArgs,
@@ -220,8 +220,7 @@ impl Station {
                 Output::Tracks(frame) => self.tracks.put(frame.encode())?,
                 Output::Smoothed(frame) => self.smoothed.put(frame.encode())?,
                 Output::Event(event) => {
-                    let number = crossfix_message::TrackNumber(event.track_id);
-                    tracing::info!("track {number} {}", event.kind().as_str_name());
+                    tracing::info!("{event}");
                     self.events.put(event.encode())?;
                 }
                 Output::Cues(cues) => self.cues.put(cues.encode())?,

@@ -36,7 +36,8 @@ impl Served {
     fn put(
         &mut self,
         topic: &str,
-        (schema, definitions): (&str, &'static [u8]),
+        schema: &str,
+        definitions: &'static [u8],
         time: Timestamp,
         data: &[u8],
     ) -> anyhow::Result<()> {
@@ -67,12 +68,12 @@ impl Served {
                 crossfix_message::file_descriptor_set(),
             );
             if let (Some(name), definitions) = schema {
-                self.put(&format!("/{key}"), (name, definitions), seen.time, data)?;
+                self.put(&format!("/{key}"), name, definitions, seen.time, data)?;
             }
         }
         for message in view.of(key, data, seen.time) {
-            let schema = (message.schema, file_descriptor_set());
-            self.put(&message.topic, schema, message.time, &message.data)?;
+            let definitions = file_descriptor_set();
+            self.put(&message.topic, message.schema, definitions, message.time, &message.data)?;
         }
         Ok(())
     }

@@ -5,7 +5,7 @@ use crossfix_geometry::{Geodetic, LocalFrame};
 use nalgebra::Point3;
 use serde_json::{Value, json};
 
-use super::report::Report;
+use super::report::PlanReport;
 
 /// An RFC 7946 position: longitude and latitude in degrees, rounded to the millimetre.
 fn position(frame: &LocalFrame, point: Point3<f64>) -> [f64; 2] {
@@ -49,7 +49,7 @@ fn cell(frame: &LocalFrame, cell: &Cell, step_m: f64, cameras: &[PlannedCamera])
 }
 
 /// The cells, layer by layer, the cameras, and the candidate places for one more camera.
-pub fn collection(report: &Report, cameras: &[PlannedCamera], anchor: Geodetic) -> Value {
+pub fn collection(report: &PlanReport, cameras: &[PlannedCamera], anchor: Geodetic) -> Value {
     let frame = LocalFrame::at(anchor);
     let mut features: Vec<Value> =
         report.cells.iter().map(|one| cell(&frame, one, report.step_m, cameras)).collect();

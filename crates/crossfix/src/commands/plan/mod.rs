@@ -10,10 +10,10 @@ use crossfix_evaluation::bound::{Assumptions, PlannedCamera, TargetSize, Volume}
 use crossfix_geometry::{Camera, Geodetic};
 use nalgebra::Point3;
 
-use self::report::Report;
-use crate::commands::numbers::{self, not_negative, positive, triple};
+use self::report::PlanReport;
+use crate::commands::numbers::{self, triple};
 use crate::config;
-use crate::output::{self, Draft};
+use crate::output::{self, Draft, Misuse};
 use crate::planned;
 
 /// Predict how well a site's cameras can do over a volume, and where one more would help most.
@@ -37,42 +37,42 @@ pub struct Args {
     #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true, requires = "min")]
     max: Option<[f64; 3]>,
     /// Side of a cell, metres. Default: a twelfth of the volume's longest side, made round.
-    #[arg(long, value_name = "METRES", value_parser = positive)]
+    #[arg(long, value_name = "METRES", value_parser = numbers::distance)]
     step: Option<f64>,
     /// How long a target has been seen, flying straight, seconds (at most 60).
     #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = window)]
     window: f64,
     /// Standard deviation of a target's place in the image, pixels per axis. Default: what each
     /// camera's calibration has found of its labels; 0.5 without.
-    #[arg(long, value_name = "PIXELS", value_parser = positive)]
+    #[arg(long, value_name = "PIXELS", value_parser = numbers::pixels)]
     pixel_sd: Option<f64>,
     /// Standard deviation of the cameras' rotation, degrees per axis. Default: each camera's own, from
     /// its calibration or file; a careful survey's 0.057 (1 mrad) where nobody has said.
-    #[arg(long, value_name = "DEGREES", value_parser = not_negative)]
+    #[arg(long, value_name = "DEGREES", value_parser = numbers::degrees)]
     rotation_sd_deg: Option<f64>,
     /// Standard deviation of the cameras' positions, metres per axis. Default: each camera's own, or a
     /// careful survey's 0.05.
-    #[arg(long, value_name = "METRES", value_parser = not_negative)]
+    #[arg(long, value_name = "METRES", value_parser = numbers::metres)]
     position_sd: Option<f64>,
     /// Standard deviation of the cameras' clocks, seconds. Default: each camera's own, from its
     /// file.
-    #[arg(long, value_name = "SECONDS", value_parser = not_negative)]
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::seconds_of_an_hour)]
     clock_sd: Option<f64>,
     /// How fast targets fly, metres per second: what an error of a clock is worth.
-    #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = not_negative)]
+    #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = numbers::metres_per_second)]
     speed: f64,
     /// What is known of a target's velocity beforehand: standard deviation, metres per second per
     /// axis; 0 is nothing.
-    #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = not_negative)]
+    #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = numbers::metres_per_second)]
     velocity_prior_sd: f64,
     /// Size of the target, metres: how far it is seen; 0 is from anywhere.
-    #[arg(long, default_value_t = 0.4, value_name = "METRES", value_parser = not_negative)]
+    #[arg(long, default_value_t = 0.4, value_name = "METRES", value_parser = numbers::metres)]
     target_size: f64,
     /// Pixels that the target must span to be seen.
-    #[arg(long, default_value_t = 6.0, value_name = "PIXELS", value_parser = positive)]
+    #[arg(long, default_value_t = 6.0, value_name = "PIXELS", value_parser = numbers::pixels)]
     min_pixels: f64,
     /// Farther than this nothing is seen, metres.
-    #[arg(long, value_name = "METRES", value_parser = positive)]
+    #[arg(long, value_name = "METRES", value_parser = numbers::distance)]
     max_range: Option<f64>,
     /// Print JSON, with every cell and every candidate.
     #[arg(long)]
@@ -90,8 +90,7 @@ pub struct Args {
 }
 
 fn window(text: &str) -> Result<f64, String> {
-    positive(text)
-        .and_then(|n| if n <= 60.0 { Ok(n) } else { Err("it must be at most 60 s".to_owned()) })
+    numbers::within(text, 0.01, 60.0, " s")
 }
 
 impl Args {
@@ -109,7 +108,8 @@ impl Args {
 
     fn volume(&self, cameras: &[PlannedCamera]) -> anyhow::Result<Volume> {
         if let (Some(min), Some(max)) = (self.min, self.max) {
-            return Ok(Volume::new(Point3::from(min), Point3::from(max), self.step)?);
+            let volume = Volume::new(Point3::from(min), Point3::from(max), self.step);
+            return volume.map_err(|error| Misuse(error.to_string()).into());
         }
         let cameras: Vec<Camera> = cameras.iter().map(|planned| planned.camera.clone()).collect();
         Volume::where_axes_cross(&cameras, self.step)
@@ -156,7 +156,7 @@ impl Args {
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let cameras = args.cameras()?;
     let volume = args.volume(&cameras)?;
-    let report = Report::new(&cameras, &volume, args.assumptions());
+    let report = PlanReport::new(&cameras, &volume, args.assumptions());
     if args.json {
         output::json(&report)?;
     } else {

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use crossfix_evaluation::bound::PlannedCamera;
 
-use super::report::Report;
+use super::report::PlanReport;
 use crate::parts;
 
 /// Fails, as there are no pictures.
-pub fn draw(_: &Report, _: &[PlannedCamera], _: &Path) -> anyhow::Result<()> {
+pub fn draw(_: &PlanReport, _: &[PlannedCamera], _: &Path) -> anyhow::Result<()> {
     Err(parts::no_pictures())
 }

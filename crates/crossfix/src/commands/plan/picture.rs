@@ -4,12 +4,12 @@ use std::path::Path;
 
 use anyhow::Context;
 use crossfix_evaluation::bound::{CandidatePlace, PlannedCamera};
-use crossfix_view::{Landmark, VolumeCell, VolumePicture};
+use crossfix_view::{DrawnLandmark, VolumeCell, VolumePicture};
 use nalgebra::Point3;
 
-use super::report::{self, Report};
+use super::report::{self, PlanReport};
 
-fn legend(report: &Report) -> String {
+fn legend(report: &PlanReport) -> String {
     let assumed = report::assumed(report).replace('\n', "\n\n");
     let conclusion = report::conclusion(report).unwrap_or_default();
     format!(
@@ -21,10 +21,10 @@ fn legend(report: &Report) -> String {
     )
 }
 
-fn landmark(report: &Report, candidate: &CandidatePlace) -> Landmark {
+fn landmark(report: &PlanReport, candidate: &CandidatePlace) -> DrawnLandmark {
     let rank = report.best.iter().position(|best| best == candidate);
     let sd = candidate.score.median_sd_m;
-    Landmark {
+    DrawnLandmark {
         place: Point3::from(candidate.position_m),
         sd_m: sd,
         label: rank.map(|rank| format!("choice {}: {sd:.3} m", rank + 1)),
@@ -32,7 +32,7 @@ fn landmark(report: &Report, candidate: &CandidatePlace) -> Landmark {
 }
 
 /// Writes the picture to a file.
-pub fn draw(report: &Report, cameras: &[PlannedCamera], path: &Path) -> anyhow::Result<()> {
+pub fn draw(report: &PlanReport, cameras: &[PlannedCamera], path: &Path) -> anyhow::Result<()> {
     let cell = |cell: &crossfix_evaluation::bound::Cell| {
         let sd_m = cell.accuracy.as_ref()?.position_sd_m;
         Some(VolumeCell { centre: Point3::from(cell.centre_m), sd_m })

@@ -17,7 +17,7 @@ const APART: f64 = 0.25;
 
 /// All predictions of a plan.
 #[derive(Debug, Serialize)]
-pub struct Report {
+pub struct PlanReport {
     /// The volume's low corner, ENU, m.
     pub min_m: [f64; 3],
     /// Its high corner, m.
@@ -35,7 +35,7 @@ pub struct Report {
     pub cells: Vec<Cell>,
 }
 
-impl Report {
+impl PlanReport {
     pub fn new(cameras: &[PlannedCamera], volume: &Volume, assumptions: Assumptions) -> Self {
         let cells = predict(cameras, volume, &assumptions);
         let advice = advise(cameras, volume, &assumptions);
@@ -70,7 +70,7 @@ fn place(place: [f64; 3]) -> String {
 }
 
 /// The assumptions, a line each.
-pub fn assumed(report: &Report) -> String {
+pub fn assumed(report: &PlanReport) -> String {
     let taken = &report.assumptions;
     let target = taken.target.map_or_else(
         || "targets of any size".to_owned(),
@@ -90,7 +90,7 @@ pub fn assumed(report: &Report) -> String {
     )
 }
 
-fn layer_table(report: &Report) -> String {
+fn layer_table(report: &PlanReport) -> String {
     let head = [
         "altitude [m]",
         "with a fix",
@@ -122,7 +122,7 @@ fn layer_table(report: &Report) -> String {
     output::table(&rows)
 }
 
-fn camera_table(report: &Report) -> String {
+fn camera_table(report: &PlanReport) -> String {
     let head = [
         "camera",
         "rate [1/s]",
@@ -158,7 +158,7 @@ fn median(score: &Score) -> Option<f64> {
     (score.fixed > 0.5).then_some(score.median_sd_m)
 }
 
-fn advice_table(report: &Report, advice: &Advice) -> String {
+fn advice_table(report: &PlanReport, advice: &Advice) -> String {
     let head = ["one more camera at [m]", "with a fix", "position SD [m]: 50 % of the volume"];
     let row = |name: String, score: &Score| {
         vec![name, percent(score.fixed), output::number(median(score), 3)]
@@ -174,7 +174,7 @@ fn advice_table(report: &Report, advice: &Advice) -> String {
 }
 
 /// The sentence with the most important number.
-pub fn conclusion(report: &Report) -> Option<String> {
+pub fn conclusion(report: &PlanReport) -> Option<String> {
     let (advice, best) = (report.advice.as_ref()?, report.best.first()?);
     let (now, then) = (advice.now, best.score);
     let metres = |sd: f64| format!("{sd:.3} m");
@@ -192,7 +192,7 @@ pub fn conclusion(report: &Report) -> Option<String> {
 }
 
 /// The results as a text for people.
-pub fn render(report: &Report) -> String {
+pub fn render(report: &PlanReport) -> String {
     let mut parts = vec![assumed(report), layer_table(report), camera_table(report)];
     parts.extend(report.smallest_target_m.map(|size| {
         format!(

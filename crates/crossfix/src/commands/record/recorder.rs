@@ -6,7 +6,7 @@ use crossfix_message::{
 };
 use crossfix_outlet::foxglove::FoxgloveView;
 use crossfix_recording::{Entry, RecordingError};
-use crossfix_transport::{NetworkConfig, Received, Reception, Refused, RunId};
+use crossfix_transport::{NetworkConfig, Received, Reception, RefusedCounts, RunId};
 
 use super::data_time::{DataTime, Said};
 use super::files::{FileWriter, Room};
@@ -272,7 +272,7 @@ impl Recorder {
     /// [`RecordingError`] if the file cannot be written.
     pub fn health(
         &mut self,
-        refused: Refused,
+        refused: RefusedCounts,
         ended: bool,
         reporter: &mut HealthReporter,
     ) -> Result<Health, RecordingError> {

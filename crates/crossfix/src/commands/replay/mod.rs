@@ -9,6 +9,7 @@ use crossfix_message::{Channel, Key, Timestamp};
 use crossfix_recording::{Entry, RecordingReader};
 
 use crate::commands::numbers;
+use crate::output::Misuse;
 use crate::recalibration::Recalibration;
 use crate::recorded::{self, Lacks};
 
@@ -35,7 +36,7 @@ pub struct Args {
     sets: Vec<String>,
     /// Let each state of a track wait this long for the bearings after it that tell of it, seconds:
     /// the tracks that are written are smoothed, and their velocities about twice as good.
-    #[arg(long, value_name = "SECONDS", requires = "fuse", value_parser = numbers::positive,
+    #[arg(long, value_name = "SECONDS", requires = "fuse", value_parser = numbers::lag,
           allow_negative_numbers = true)]
     smooth: Option<f64>,
     /// The recording (MCAP) to write: all that was recorded, with the new tracks in place of the
@@ -43,11 +44,11 @@ pub struct Args {
     #[arg(short, long, value_name = "FILE", requires = "fuse")]
     output: Option<PathBuf>,
     /// Start this long after the first bearing, seconds of data time.
-    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::not_negative,
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::seconds,
           allow_negative_numbers = true)]
     from: f64,
     /// End this long after the first bearing, seconds of data time.
-    #[arg(long, value_name = "SECONDS", value_parser = numbers::positive, allow_negative_numbers = true)]
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::seconds, allow_negative_numbers = true)]
     to: Option<f64>,
     /// The network's file (TOML) to publish on; the replay stands in for the site's cameras.
     #[arg(long, value_name = "FILE", conflicts_with = "fuse", required_unless_present = "fuse")]
@@ -87,7 +88,10 @@ impl Range {
     /// The range that was asked for, counted from the recording's first bearing or track.
     fn of(args: &Args, recalibration: Option<&Recalibration>) -> anyhow::Result<Self> {
         let to_s = args.to.unwrap_or(f64::INFINITY);
-        ensure!(args.from < to_s, "--from {} is not before --to {to_s}", args.from);
+        ensure!(
+            args.from < to_s,
+            Misuse(format!("--from {} is not before --to {to_s}", args.from))
+        );
         let is_whole = args.from == 0.0 && args.to.is_none();
         if is_whole && args.fuse {
             // When all of it is fused, beginning and end do not matter.

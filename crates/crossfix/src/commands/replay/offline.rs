@@ -3,9 +3,9 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
+use anyhow::{bail, ensure};
 use crossfix_fusion::Output;
-use crossfix_message::{Channel, Key, Payload, SiteName, Timestamp, TrackNumber};
+use crossfix_message::{Channel, Key, Payload, SiteName, Timestamp};
 use crossfix_recording::{Entry, RecordingWriter, Source};
 
 use super::{Args, Range, calibrations};
@@ -92,7 +92,7 @@ pub fn fuse(
     }
     lacks.say(&args.recording);
     lacks.ensure_found(run.frames > 0, "bearings in that range", &args.recording)?;
-    run.finish(args, output)?;
+    let found = run.finish(args, output)?;
     draft.keep()?;
     if shutdown.requested() {
         bail!(
@@ -101,7 +101,23 @@ pub fn fuse(
             output.display()
         );
     }
-    Ok(())
+    found.ensure_any()
+}
+
+/// What was found in a recording.
+struct Found {
+    frames: u64,
+    track_frames: u64,
+    /// Why it is nothing, if that is known.
+    why_nothing: Option<String>,
+}
+
+impl Found {
+    fn ensure_any(&self) -> anyhow::Result<()> {
+        let why = self.why_nothing.as_ref().map_or_else(String::new, |why| format!(": {why}"));
+        ensure!(self.track_frames > 0, "no target found in {} bearing frames{why}", self.frames);
+        Ok(())
+    }
 }
 
 impl OfflineFusion {
@@ -140,8 +156,7 @@ impl OfflineFusion {
                 }
                 Output::Event(event) => {
                     let time = Timestamp::from_nanos(event.time_ns);
-                    let number = TrackNumber(event.track_id);
-                    tracing::debug!("{time}: track {number} {}", event.kind().as_str_name());
+                    tracing::debug!("{time}: {event}");
                     self.put(Channel::Events, time, event.encode())?;
                 }
                 Output::Cues(cues) => {
@@ -177,7 +192,7 @@ impl OfflineFusion {
         Ok(())
     }
 
-    fn finish(mut self, args: &Args, path: &Path) -> anyhow::Result<()> {
+    fn finish(mut self, args: &Args, path: &Path) -> anyhow::Result<Found> {
         let last = self.centre.flush();
         self.write(last)?;
         self.write_health(self.centre.now(), true)?;
@@ -189,16 +204,16 @@ impl OfflineFusion {
         let unread =
             health.counters.iter().filter(|counter| unread.contains(&counter.name.as_str()));
         let unread: u64 = unread.map(|counter| counter.value).sum();
-        anyhow::ensure!(
+        ensure!(
             unread < self.frames,
             "none of {} messages of {} can be read: it is damaged, or of a newer version",
             unread,
             args.recording.display()
         );
         self.writer.finish()?;
-        let (frames, tracks) = (self.frames, self.centre.frames());
+        let (frames, track_frames) = (self.frames, self.centre.frames());
         output::line(format!(
-            "{frames} bearing frames fused, {tracks} track frames written to {}",
+            "{frames} bearing frames fused, {track_frames} track frames written to {}",
             path.display()
         ));
         output::line(format!(
@@ -207,6 +222,6 @@ impl OfflineFusion {
             self.busy.as_secs_f64() * 1e6 / frames as f64,
             self.longest.as_secs_f64() * 1e3
         ));
-        Ok(())
+        Ok(Found { frames, track_frames, why_nothing: self.centre.why_nothing() })
     }
 }

@@ -9,7 +9,7 @@ use crossfix_message::{
     BearingFrame, CameraName, Channel, CueFrame, Health, Key, Payload, Preview, Timestamp,
     TrackEvent, TrackFrame, TruthFrame, decode,
 };
-use crossfix_recording::Entry;
+use crossfix_recording::{Entry, RecordingInfo};
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
 
 use super::{Args, Range};
@@ -44,6 +44,7 @@ fn is_cameras(channel: &Channel) -> bool {
 pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
     let network = config::load_network(network)?;
+    ensure_known(&args.recording, &network)?;
     let Some(link) =
         network::open(&network, &Role::Cameras { and_fusion: args.tracks }, &shutdown)?
     else {
@@ -86,6 +87,27 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
     drop((publishers, alive));
     link.close(if shutdown.requested() { LEAVE } else { LONG_LEAVE })?;
     output::line(format!("{published} messages published"));
+    Ok(())
+}
+
+/// Refuses a recording that the network's site cannot hear or read.
+fn ensure_known(recording: &Path, network: &NetworkConfig) -> anyhow::Result<()> {
+    let info = RecordingInfo::of(recording)?;
+    ensure!(
+        info.newer == 0,
+        "{} messages of {} are of a newer version: update this side",
+        info.newer,
+        recording.display()
+    );
+    let unknown = info.cameras.iter().filter(|camera| !network.cameras.contains_key(*camera));
+    let unknown: Vec<String> = unknown.map(|camera| format!("`{camera}`")).collect();
+    ensure!(
+        unknown.is_empty(),
+        "the network of site `{}` lacks cameras of {}: {}",
+        network.site,
+        recording.display(),
+        unknown.join(", ")
+    );
     Ok(())
 }
 

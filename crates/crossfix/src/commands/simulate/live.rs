@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use anyhow::{Context, anyhow};
 use crossfix_message::Timestamp;
 use crossfix_simulation::{SimulatedCamera, World};
-use crossfix_video::{H264Encoder, Mount, RtspServer};
+use crossfix_video::{H264Encoder, RtspServer, ServedStream};
 
 use crate::output;
 use crate::pace::Pace;
@@ -32,7 +32,7 @@ pub fn play(
     let mut server =
         RtspServer::bind(address, None).with_context(|| format!("cannot listen at {address}"))?;
     let pace = Pace::beginning_at(begins.seconds(), 1.0);
-    let mounted: Vec<(&SimulatedCamera, Mount)> = world
+    let mounted: Vec<(&SimulatedCamera, ServedStream)> = world
         .cameras()
         .iter()
         .map(|camera| (camera, server.mount(camera.name().as_str())))
@@ -54,7 +54,7 @@ pub fn play(
 /// Streams what one camera sees, each frame at its time of exposure.
 fn film(
     camera: &SimulatedCamera,
-    mount: &Mount,
+    mount: &ServedStream,
     begins: Timestamp,
     pace: Pace,
     shutdown: &Shutdown,

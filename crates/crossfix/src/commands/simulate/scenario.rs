@@ -2,12 +2,14 @@
 
 use std::path::Path;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use crossfix_simulation::{SimulatedSite, Site, SiteCamera};
 use nalgebra::{Matrix3, Vector3};
 use serde_json::json;
 
+use crate::output::{self, Draft};
 use crate::scenario::{DetectionRow, ExposureRow, FORMAT, TruthRow, turned};
+use crate::shutdown::Shutdown;
 
 /// What a generated site is made of.
 #[derive(Debug, clap::Args)]
@@ -55,20 +57,38 @@ impl SiteArgs {
     }
 }
 
-fn table(dir: &Path, name: &str) -> anyhow::Result<csv::Writer<std::fs::File>> {
-    let path = dir.join(name);
-    csv::Writer::from_path(&path).with_context(|| format!("cannot write {}", path.display()))
+/// A table of the scenario's folder that is complete once it is closed.
+struct Table {
+    rows: csv::Writer<std::fs::File>,
+    draft: Draft,
 }
 
-/// Writes `scenario.json`, `detections.csv`, `exposures.csv` and `truth.csv`; returns the number of
-/// exposures. Scoring times are those of the last camera's exposures.
-pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
+impl Table {
+    fn new(dir: &Path, name: &str) -> anyhow::Result<Self> {
+        let draft = Draft::new(&dir.join(name), &[])?;
+        let rows = csv::Writer::from_path(draft.path())
+            .with_context(|| format!("cannot write {}", draft.path().display()))?;
+        Ok(Self { rows, draft })
+    }
+
+    fn close(mut self) -> anyhow::Result<()> {
+        self.rows.flush()?;
+        self.draft.keep()
+    }
+}
+
+/// Writes `scenario.json`, `detections.csv`, `exposures.csv` and `truth.csv`, all or none; returns
+/// the number of exposures. Scoring times are those of the last camera's exposures.
+pub fn write(site: &SimulatedSite, dir: &Path, shutdown: &Shutdown) -> anyhow::Result<u64> {
     std::fs::create_dir_all(dir).with_context(|| format!("cannot make {}", dir.display()))?;
-    let (mut detections, mut exposures) =
-        (table(dir, "detections.csv")?, table(dir, "exposures.csv")?);
-    let mut truth = table(dir, "truth.csv")?;
+    let [mut detections, mut exposures, mut truth] = [
+        Table::new(dir, "detections.csv")?,
+        Table::new(dir, "exposures.csv")?,
+        Table::new(dir, "truth.csv")?,
+    ];
     let mut epochs = Vec::new();
     for exposure in site.bearings() {
+        ensure!(!shutdown.requested(), "asked to stop");
         let (cam, scan) = (exposure.camera as u32, exposure.frame.sequence);
         // The frame's own time, rounded to a nanosecond.
         let t = exposure.frame.capture_time_ns as f64 / 1e9;
@@ -78,7 +98,7 @@ pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
             let u = turned(track.bearing.unwrap_or_default().into());
             let truth_id = source.map_or(-1, |id| id as i64);
             let sigma_rad = track.covariance_xx.sqrt();
-            detections.serialize(DetectionRow {
+            detections.rows.serialize(DetectionRow {
                 t,
                 cam,
                 scan,
@@ -90,10 +110,10 @@ pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
                 truth_id,
             })?;
         }
-        exposures.serialize(ExposureRow { t, cam, scan, n: exposure.frame.tracks.len() })?;
+        exposures.rows.serialize(ExposureRow { t, cam, scan, n: exposure.frame.tracks.len() })?;
         for target in site.truth(exposure.time_s) {
             let (p, v) = (target.position, target.velocity);
-            truth.serialize(TruthRow {
+            truth.rows.serialize(TruthRow {
                 t,
                 id: target.id,
                 x: p.x,
@@ -108,12 +128,11 @@ pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
             epochs.push(t);
         }
     }
-    for mut table in [detections, exposures, truth] {
-        table.flush()?;
+    for table in [detections, exposures, truth] {
+        table.close()?;
     }
-    let path = dir.join("scenario.json");
     let text = serde_json::to_string_pretty(&description(site, &epochs))?;
-    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
+    output::write_file(&dir.join("scenario.json"), &[], text.as_bytes())?;
     Ok(site.exposures())
 }
 
@@ -170,7 +189,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let site =
             Site { duration_s: 1.0, targets: 5, clutter: 2.0, ..Site::default() }.build().unwrap();
-        assert_eq!(write(&site, dir.path()).unwrap(), 120);
+        assert_eq!(write(&site, dir.path(), &Shutdown::listen()).unwrap(), 120);
         let entries = scenario::read(dir.path()).unwrap();
         let mut frames = Vec::new();
         let mut truths = 0;

@@ -22,7 +22,7 @@ const MOST_EVENTS: usize = 100;
 
 /// A camera on the plan.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct PlannedCamera {
+pub struct CameraOnPlan {
     pub name: String,
     /// East and north, m.
     pub at: [f64; 2],
@@ -60,7 +60,7 @@ pub struct Event {
 pub struct Plan {
     /// The time of the newest tracks, seconds since the Unix epoch.
     pub time_s: Option<f64>,
-    pub cameras: Vec<PlannedCamera>,
+    pub cameras: Vec<CameraOnPlan>,
     pub tracks: Vec<PlannedTrack>,
     /// The newest event first.
     pub events: Vec<Event>,
@@ -70,7 +70,7 @@ pub struct Plan {
 #[derive(Debug, Default)]
 pub struct PlanBoard {
     known: Vec<CameraName>,
-    cameras: BTreeMap<CameraName, PlannedCamera>,
+    cameras: BTreeMap<CameraName, CameraOnPlan>,
     tracks: BTreeMap<u64, (Track, Instant)>,
     events: VecDeque<Event>,
     time: Option<Timestamp>,
@@ -113,10 +113,8 @@ impl PlanBoard {
     }
 
     fn note(&mut self, event: &TrackEvent) {
-        let word = event.kind().as_str_name().trim_start_matches("TRACK_EVENT_KIND_");
-        let what = format!("track {} {}", TrackNumber(event.track_id), word.to_lowercase());
         let time_s = Timestamp::from_nanos(event.time_ns).seconds();
-        self.events.push_front(Event { time_s, what });
+        self.events.push_front(Event { time_s, what: event.to_string() });
         self.events.truncate(MOST_EVENTS);
     }
 
@@ -133,10 +131,10 @@ impl PlanBoard {
     }
 }
 
-fn planned(name: &CameraName, calibration: &Calibration) -> PlannedCamera {
+fn planned(name: &CameraName, calibration: &Calibration) -> CameraOnPlan {
     let place = calibration.camera.pose().position();
     let view_deg = calibration.mount.is_none().then(|| view(&calibration.camera)).flatten();
-    PlannedCamera { name: name.to_string(), at: [place.x, place.y], view_deg }
+    CameraOnPlan { name: name.to_string(), at: [place.x, place.y], view_deg }
 }
 
 /// Azimuths, degrees, of the directions through the middles of the image's left and right edges.

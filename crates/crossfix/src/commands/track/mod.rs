@@ -9,6 +9,7 @@ use std::str::FromStr;
 use std::time::Instant;
 
 use anyhow::{bail, ensure};
+use crossfix_correlation::Plane;
 use crossfix_video::{Frame, FrameClock, FrameSource, VideoError};
 use crossfix_vision::{DetectorConfig, ImageTracker, PixelBox, TrackerConfig};
 
@@ -102,46 +103,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         .map(|draft| Picture::new(draft.path(), args.labels.as_deref()))
         .transpose()?;
 
-    let mut repeats = Repeats::default();
-    let (mut frames, mut bad_frames) = (0_u64, 0_u64);
-    let mut length = 0;
-    while let Some((index, read)) = next(source.as_mut(), &mut repeats)? {
-        length = index + 1;
-        if index < args.from {
-            continue;
-        }
-        let image = read.as_ref().and_then(eye::brightness);
-        let (Some(frame), Some(image)) = (&read, &image) else {
-            if read.is_some() {
-                tracing::warn!("frame {index} has no pixels; going on");
-            }
-            bad_frames += 1;
-            table.write(index, &[], 0.0)?;
-            continue;
-        };
-        let begun = Instant::now();
-        let tracks = tracker.step(image, frame.capture.time);
-        let microseconds = begun.elapsed().as_secs_f64() * 1e6;
-        frames += 1;
-        table.write(index, tracks, microseconds)?;
-        if let Some(picture) = &picture {
-            picture.show(frame, image, tracks)?;
-        }
-    }
-    if length <= args.from {
-        bail!(
-            "{} has {length} frames, counted from 0: there is no frame {}",
-            args.video.display(),
-            args.from
-        );
-    }
-    ensure!(
-        bad_frames <= frames,
-        "{}: {bad_frames} of {} frames could not be decoded",
-        args.video.display(),
-        frames + bad_frames
-    );
-    repeats.remind(Instant::now());
+    let counted = follow(args, source.as_mut(), &mut tracker, &mut table, picture.as_ref())?;
+    counted.ensure_usable(args)?;
     if tracker.refused() > 0 {
         tracing::warn!(
             "{} frames were refused: another size, or not after the one before",
@@ -159,7 +122,88 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         ));
     }
     if let Some(path) = &args.csv {
-        output::line(format!("{frames} frames tracked, boxes written to {}", path.display()));
+        output::line(format!(
+            "{} frames tracked, boxes written to {}",
+            counted.tracked,
+            path.display()
+        ));
+    }
+    Ok(())
+}
+
+/// What a video held.
+#[derive(Default)]
+struct Counted {
+    /// Number of its frames, also of those that were skipped.
+    length: u64,
+    tracked: u64,
+    /// Frames that could not be decoded.
+    bad: u64,
+}
+
+impl Counted {
+    fn ensure_usable(&self, args: &Args) -> anyhow::Result<()> {
+        let &Self { length, tracked, bad } = self;
+        let video = args.video.display();
+        ensure!(
+            length > args.from,
+            "{video} has {length} frames, counted from 0: there is no frame {}",
+            args.from
+        );
+        let all = tracked + bad;
+        ensure!(bad <= tracked, "{video}: {bad} of {all} frames could not be decoded");
+        Ok(())
+    }
+}
+
+/// Follows the targets through a video.
+fn follow(
+    args: &Args,
+    source: &mut dyn FrameSource,
+    tracker: &mut ImageTracker,
+    table: &mut Table,
+    picture: Option<&Picture>,
+) -> anyhow::Result<Counted> {
+    let mut repeats = Repeats::default();
+    let mut counted = Counted::default();
+    while let Some((index, read)) = next(source, &mut repeats)? {
+        counted.length = index + 1;
+        if index < args.from {
+            continue;
+        }
+        let image = read.as_ref().and_then(eye::brightness);
+        let (Some(frame), Some(image)) = (&read, &image) else {
+            if read.is_some() {
+                tracing::warn!("frame {index} has no pixels; going on");
+            }
+            counted.bad += 1;
+            table.write(index, &[], 0.0)?;
+            continue;
+        };
+        if counted.tracked == 0 {
+            ensure_inside(&args.places, image)?;
+        }
+        let begun = Instant::now();
+        let tracks = tracker.step(image, frame.capture.time);
+        let microseconds = begun.elapsed().as_secs_f64() * 1e6;
+        counted.tracked += 1;
+        table.write(index, tracks, microseconds)?;
+        if let Some(picture) = picture {
+            picture.show(frame, image, tracks)?;
+        }
+    }
+    repeats.remind(Instant::now());
+    Ok(counted)
+}
+
+/// Refuses boxes of which no part lies in the image.
+fn ensure_inside(places: &[BoxArg], image: &Plane) -> anyhow::Result<()> {
+    let (width, height) = (image.width(), image.height());
+    for BoxArg(PixelBox { x, y, width: wide, height: high }) in places {
+        ensure!(
+            (-wide..width as f64).contains(x) && (-high..height as f64).contains(y),
+            "the box {x},{y},{wide},{high} lies outside the image of {width}x{height} pixels"
+        );
     }
     Ok(())
 }

@@ -11,6 +11,9 @@ use crate::output;
 
 /// Make the papers' tables and figures again, beside the papers' figures.
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  crossfix validate tracker --runs 1000 --only loss\n  crossfix validate fusion --runs 4000 --only bound"
+)]
 pub struct Args {
     #[command(subcommand)]
     what: What,

@@ -118,12 +118,12 @@ fn fixes(lines: &[Vec<(LineId, TimedLine)>]) -> Vec<PeriodFix> {
                     let Some(solution) = solution.filter(|s| s.indicator <= PAIR_GATE) else {
                         continue;
                     };
-                    let velocity = (Vector3::zeros(), VelocityKnowledge::Unknown);
                     let observability = Observability::full(2, 1.0);
                     let lines = vec![one.clone(), two.clone()];
                     fixes.push(period_fix(
                         solution.position,
-                        velocity,
+                        Vector3::zeros(),
+                        VelocityKnowledge::Unknown,
                         Solver::Pair,
                         observability,
                         lines,
@@ -139,11 +139,11 @@ fn fixes(lines: &[Vec<(LineId, TimedLine)>]) -> Vec<PeriodFix> {
                         else {
                             continue;
                         };
-                        let velocity = (solution.velocity, VelocityKnowledge::Solved);
                         let lines = vec![one.clone(), two.clone(), three.clone()];
                         fixes.push(period_fix(
                             solution.position,
-                            velocity,
+                            solution.velocity,
+                            VelocityKnowledge::Solved,
                             Solver::Triple,
                             solution.observability,
                             lines,
@@ -161,7 +161,8 @@ fn fixes(lines: &[Vec<(LineId, TimedLine)>]) -> Vec<PeriodFix> {
 /// is set.
 fn period_fix(
     position: Point3<f64>,
-    (velocity, knowledge): (Vector3<f64>, VelocityKnowledge),
+    velocity: Vector3<f64>,
+    knowledge: VelocityKnowledge,
     solver: Solver,
     observability: Observability,
     lines: Vec<(LineId, TimedLine)>,

@@ -39,13 +39,20 @@ const GIVEN_UP: f64 = -5.0;
 /// largest range is taken for its range. With half of it that range is 0.7 times as long, which is
 /// little beside its uncertainty.
 const NEAREST_M: f64 = 30.0;
-/// Bounds on time: most directions followed in one camera, lost ones tried in one exposure,
-/// readings of one direction, and others tried with one direction. With half of them a target goes
-/// unfollowed where its camera sees ten strangers at a time.
-const MAX_SEEN: usize = 20;
-const MAX_LOST: usize = 20;
-const MAX_READINGS: usize = 4;
-const MAX_TRIED: usize = 50;
+/// Bounds on time. With half of them a target goes unfollowed where its camera sees ten other
+/// targets at a time.
+struct Most {
+    /// Directions that are followed in one camera.
+    seen: usize,
+    /// Lost directions that are tried in one exposure.
+    lost: usize,
+    /// Readings of one direction at a time, ...
+    readings: usize,
+    /// ... and others' lines that are tried with it.
+    tried: usize,
+}
+
+const MOST: Most = Most { seen: 20, lost: 20, readings: 4, tried: 50 };
 
 /// The directions that each camera follows alone, and their readings.
 #[derive(Debug)]
@@ -195,7 +202,7 @@ impl Handover {
         // What a track or something rooted explains is no direction of its own any more.
         seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
         for (index, line) in with_pose.into_iter().enumerate() {
-            if !taken[index] && !is_known(index) && seen.len() < MAX_SEEN {
+            if !taken[index] && !is_known(index) && seen.len() < MOST.seen {
                 self.count += 1;
                 seen.push(SeenDirection::first(self.count, line, exposure, index));
             }
@@ -226,21 +233,20 @@ impl Handover {
             })
             .collect();
         lost.sort_by_key(|(_, one)| Reverse(one.sight.time));
-        for (camera, one) in lost.into_iter().take(MAX_LOST) {
+        for (camera, one) in lost.into_iter().take(MOST.lost) {
             let since =
                 begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
             for &ContinuedLine { index, number, .. } in since.filter(|other| !is_owned[other.index])
             {
                 let name = (exposure.camera.clone(), exposure.sequence, index);
                 let is_read = one.readings.iter().any(|reading| reading.newest == name);
-                let is_full = one.readings.len() >= MAX_READINGS || one.tried.len() >= MAX_TRIED;
+                let is_full = one.readings.len() >= MOST.readings || one.tried.len() >= MOST.tried;
                 if is_read || is_full || !one.tried.insert(number) {
                     continue;
                 }
                 let line = &exposure.sightings[index].line;
-                let reading = one
-                    .placed(camera, (line, now), (self.rules.speed, self.rules.max_range_m), motion)
-                    .and_then(|track| {
+                let reading =
+                    one.placed(camera, line, now, &self.rules, motion).and_then(|track| {
                         // Price of the velocity that the reading implies: v^2 / (2 sd^2), of a
                         // prior about zero.
                         let unlikely = track.state().velocity().norm_squared()

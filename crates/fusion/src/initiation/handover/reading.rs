@@ -4,11 +4,11 @@ use crossfix_filter::Gate;
 use crossfix_message::CameraName;
 
 use super::super::MAX_LINES;
-use super::super::one_target::OneTargetTest;
+use super::super::one_target::{Mobility, OneTargetTest};
 use crate::cameras::{KnownCamera, view_sr};
 use crate::motion::MotionSetup;
 use crate::spatial::LineId;
-use crate::track::{Track, TrackExpectation};
+use crate::track::{Track, TrackBearing, TrackExpectation};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
@@ -66,8 +66,8 @@ impl ReadingContext<'_> {
 
     /// The bearing of a track that is predicted for the exposure's camera.
     pub(super) fn expectation(&self, track: &Track) -> Option<TrackExpectation> {
-        let seen_from = (&self.exposure.camera, self.known.camera.pose().position());
-        track.expectation(self.exposure.time, seen_from, &self.uncertainty(), self.motion)
+        let (camera, origin) = (&self.exposure.camera, self.known.camera.pose().position());
+        track.expectation(self.exposure.time, camera, origin, &self.uncertainty(), self.motion)
     }
 }
 
@@ -117,12 +117,13 @@ impl Reading {
         rules: &Rules,
     ) -> Option<()> {
         let ReadingContext { exposure, motion, .. } = *context;
-        let Exposure { camera, time, uncertainty, sightings, .. } = exposure;
+        let Exposure { camera, time, sightings, .. } = exposure;
         let line = &sightings[index].line;
+        let uncertainty = context.uncertainty();
+        let bearing = TrackBearing { uncertainty: &uncertainty, ..exposure.bearing(line) };
         let density = motion.density(self.track.model_probabilities());
-        self.track.measurement_update(camera, line, (*time, &context.uncertainty()), motion)?;
+        self.track.measurement_update(bearing, motion)?;
         self.track.look(camera, *time, true, rules.tracking.detection_probability, motion);
-        let timed = (line, *time, uncertainty.time_sd_s);
         // If two other cameras see something at the same time, their agreement tells nothing about
         // what the first camera saw before.
         let is_joint = self.track.residuals.iter().any(|(name, residual)| {
@@ -131,12 +132,13 @@ impl Reading {
         let first_ratio = if is_joint { 0.0 } else { first_ratio };
         match expected {
             TrackExpectation::Near(prediction) => {
-                self.one_target.see(camera, timed, prediction, (density, rules.speed), first_ratio);
+                let mobility = Mobility { density, speed: rules.speed };
+                self.one_target.see(&bearing, prediction, mobility, first_ratio);
             }
             TrackExpectation::Along { .. } if self.one_target.knows(camera) => {}
             TrackExpectation::Along { .. } => {
                 let range = (self.track.state().position() - line.origin).norm();
-                self.one_target.see_first(camera, (line, *time), rules.speed / range, first_ratio);
+                self.one_target.see_first(&bearing, rules.speed / range, first_ratio);
             }
         }
         self.newest = (camera.clone(), exposure.sequence, index);

@@ -8,6 +8,7 @@ use crossfix_message::{CameraName, Solver, Timestamp};
 use nalgebra::{Matrix3, Vector3, Vector6};
 
 use super::super::sight::DirectionFilter;
+use super::Rules;
 use super::reading::Reading;
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
@@ -102,28 +103,30 @@ impl SeenDirection {
         sight
     }
 
-    /// A track of it, at the position where its direction at a time crosses another camera's line.
-    /// The target's speed along the direction has a standard deviation of `speed` (m/s). `None` if
-    /// the lines do not cross within range in front of both cameras.
+    /// A track of it, as `camera` has followed it, at the position where its direction at a time
+    /// crosses another camera's line. `None` if the lines do not cross within range in front of
+    /// both cameras.
     pub(super) fn placed(
         &self,
         camera: &CameraName,
-        (line, time): (&SightLine, Timestamp),
-        (speed, max_range_m): (f64, f64),
+        line: &SightLine,
+        time: Timestamp,
+        rules: &Rules,
         motion: &MotionSetup,
     ) -> Option<Track> {
         let Self { sight, line: last, uncertainty, .. } = self;
+        let max_range_m = rules.max_range_m;
         let by_now = self.at(time).direction;
         let [range, there] =
             passing_ranges((last.line.origin, &by_now), (line.origin, &line.direction));
         if ![range, there].iter().all(|range| (f64::MIN_POSITIVE..=max_range_m).contains(range)) {
             return None;
         }
-        let state = self.state_at(range, speed)?;
+        let state = self.state_at(range, rules.speed)?;
         let observability = Observability::unexamined(6);
         let (velocity, solver) = (VelocityKnowledge::Solved, Solver::Map);
         let fix = Fix { time: sight.time, state, velocity, solver, observability };
-        Some(Track::start_alone(&fix, (camera, last, *uncertainty), motion))
+        Some(Track::start_alone(&fix, camera, last, *uncertainty, motion))
     }
 
     /// Its position and velocity at its last line, if its unknown range is about `range` (m). The
