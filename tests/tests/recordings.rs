@@ -319,6 +319,26 @@ fn what_a_file_lacks_is_said_and_an_unanswered_question_fails() {
         assert!(!Path::new(&csv).exists() && !Path::new(&rrd).exists());
     }
     stderr(&["info", &path("empty.mcap")], 1);
+    assert!(stderr(&["info", &path("newer.mcap")], 1).contains("they are of a newer version"));
+    let evaluate = ["evaluate", &path("tracks.mcap"), "--truth", &path("source.mcap")];
+    let late = [&evaluate[..], &["--skip-s", "1000"]].concat();
+    assert!(stderr(&late, 1).contains("none is at least 1000 s after the first"));
+    // A sky with nothing in it: the recording is written, and the question is not answered.
+    let mut empty_sky = RecordingWriter::create(Path::new(&path("sky.mcap"))).unwrap();
+    for entry in messages(Path::new(&path("source.mcap")), |_| true) {
+        let data = match entry.key.channel {
+            Channel::Bearings(_) => {
+                let frame: BearingFrame = decode(&entry.data).unwrap();
+                BearingFrame { tracks: Vec::new(), ..frame }.encode_unstamped()
+            }
+            _ => entry.data.clone(),
+        };
+        empty_sky.write(&Entry { data, ..entry }).unwrap();
+    }
+    empty_sky.finish().unwrap();
+    let said = stderr(&["replay", &path("sky.mcap"), "--fuse", "-o", &path("none.mcap")], 1);
+    assert!(said.contains("no target found in"), "{said}");
+    assert!(succeed(&["info", &path("none.mcap")]).contains("complete"));
     for arguments in [
         vec!["export", &path("torn.mcap"), "--csv", &csv],
         vec!["evaluate", &path("torn.mcap"), "--truth", &path("source.mcap")],

@@ -137,6 +137,45 @@ fn a_fusion_centre_whose_router_is_not_there_says_so_and_ends_when_asked() {
     assert!(took < LIMIT, "{took:?}");
 }
 
+/// Files of a folder.
+fn files_of(folder: &Path) -> Vec<std::path::PathBuf> {
+    std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect()
+}
+
+#[test]
+fn a_simulation_that_is_asked_to_stop_leaves_no_half_files() {
+    let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/demo/scene.toml");
+    let long = ["--set", "duration_s=3600"];
+    for (to, source) in [
+        ("--scenario", &["simulate", "--seconds", "100000"][..]),
+        ("--video", &["simulate", scene, long[0], long[1]]),
+        ("-o", &["simulate", scene, long[0], long[1]]),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut output = folder.path().to_owned();
+        if to == "-o" {
+            output.push("a.mcap");
+        }
+        let simulation = std::process::Command::new(crossfix_tests::program())
+            .args(source)
+            .arg(to)
+            .arg(output)
+            .stderr(std::process::Stdio::piped())
+            .spawn()
+            .unwrap();
+        std::thread::sleep(Duration::from_millis(500));
+        let pid = simulation.id().to_string();
+        std::process::Command::new("kill").args(["-TERM", &pid]).status().unwrap();
+        let asked = Instant::now();
+        let ended = simulation.wait_with_output().unwrap();
+        assert!(asked.elapsed() < LIMIT, "{to}: {:?}", asked.elapsed());
+        let said = String::from_utf8_lossy(&ended.stderr).into_owned();
+        assert_eq!(ended.status.code(), Some(1), "{to}: {said}");
+        assert!(said.contains("asked to stop"), "{to}: {said}");
+        assert_eq!(files_of(folder.path()), Vec::<std::path::PathBuf>::new(), "{to}");
+    }
+}
+
 #[test]
 fn an_interrupted_replay_leaves_a_whole_file_that_ends_early() {
     let site = Site::new(60.0);

@@ -1,22 +1,49 @@
 //! Calibration of cameras: poses, clocks and lenses with their covariance, from the flight of one
 //! target ([`calibrate_flight`]) or from landmarks in a picture ([`calibrate_landmarks`]); the file
 //! of a site that holds them ([`SiteCalibration`]); and intrinsics as OpenCV, ROS and Kalibr write
-//! them:
+//! them ([`intrinsics_from_yaml`]).
+//!
+//! A camera that nobody has surveyed labels a minute of a flight whose log there is:
 //!
 //! ```
-//! use crossfix_calibration::intrinsics_from_yaml;
-//! use crossfix_geometry::Distortion;
+//! use crossfix_calibration::{
+//!     CameraLabels, FlightLog, Label, LensFreedom, LogErrors, LogSample, Survey, calibrate_flight,
+//! };
+//! use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
+//! use nalgebra::Point3;
 //!
-//! let intrinsics = intrinsics_from_yaml(
-//!     "image_width: 640\n\
-//!      image_height: 480\n\
-//!      camera_matrix: {rows: 3, cols: 3, data: [700.0, 0.0, 319.5, 0.0, 701.0, 239.5, 0.0, 0.0, 1.0]}\n\
-//!      distortion_model: plumb_bob\n\
-//!      distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.01, 0.0, 0.0, 0.0]}\n",
-//! )?;
-//! assert_eq!(intrinsics.fy, 701.0);
-//! assert!(matches!(intrinsics.distortion, Distortion::BrownConrady(_)));
-//! # Ok::<(), crossfix_calibration::IntrinsicsError>(())
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! // The flight, and the camera as it stands; its clock is 0.7 s ahead of the log's.
+//! let flight = |t: f64| {
+//!     Point3::new(30.0 * (0.4 * t).sin(), 25.0 * (0.6 * t).cos(), 32.0 + 12.0 * (0.5 * t).sin())
+//! };
+//! let size = ImageSize { width: 1920, height: 1080 };
+//! let distortion = Distortion::None;
+//! let intrinsics =
+//!     Intrinsics { size, fx: 1100.0, fy: 1100.0, cx: 959.5, cy: 539.5, distortion };
+//! let pose = Pose::looking_at([60.0, 10.0, 1.5].into(), [0.0, 0.0, 30.0].into())?;
+//! let camera = Camera::new(intrinsics, pose)?;
+//!
+//! let times = || (0..600).map(|k| f64::from(k) / 10.0);
+//! let samples = times().map(|time_s| LogSample { time_s, position: flight(time_s) }).collect();
+//! let errors = LogErrors { sd_m: 0.02, drift_sd_m: 0.02, drift_time_s: 200.0 };
+//! // Labels to a tenth of a pixel.
+//! let tenth = |pixel: f64| (10.0 * pixel).round() / 10.0;
+//! let label = |t: f64| {
+//!     let seen = camera.project(flight(t))?;
+//!     Some(Label { time_s: t + 0.7, pixel: Pixel::new(tenth(seen.x()), tenth(seen.y())) })
+//! };
+//! let labels = times().filter_map(label).collect();
+//! let north =
+//!     CameraLabels { name: "north".parse()?, intrinsics, freedom: LensFreedom::Keep, labels };
+//!
+//! let log = FlightLog { samples, errors };
+//! let result = calibrate_flight(&[north], Some(&log), &Survey::default())?;
+//! let found = &result.cameras[0];
+//! let off = found.camera.pose().position() - camera.pose().position();
+//! assert!(off.norm() < 0.1, "{off}");
+//! assert!((found.clock.knots[0].ahead_s + 0.7).abs() < 0.01);
+//! # Ok(()) }
 //! ```
 
 mod calibrated_camera;

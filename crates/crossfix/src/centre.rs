@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-use crossfix_fusion::{CameraReport, CameraTrust, Fusion, FusionConfig, FusionConfigError, Output};
+use crossfix_fusion::{CameraReport, Fusion, FusionConfig, FusionConfigError, Output, Standing};
 use crossfix_message::{
     BearingFrame, CameraCalibration, CameraHealth, CameraName, Channel, Counter, DecodeError,
     Health, Payload, Timestamp, decode,
@@ -250,7 +250,7 @@ impl Centre {
     /// The cameras that the fusion leaves out.
     pub fn left_out(&self) -> Vec<CameraName> {
         let reports = self.fusion.cameras();
-        let left_out = reports.filter(|report| report.standing == CameraTrust::Excluded);
+        let left_out = reports.filter(|report| report.standing == Standing::Excluded);
         left_out.map(|report| report.camera).collect()
     }
 
@@ -314,8 +314,8 @@ impl Centre {
 }
 
 /// Logs that a camera is left out, or used again.
-fn report_camera(camera: &CameraName, standing: CameraTrust) {
-    if standing == CameraTrust::Excluded {
+fn report_camera(camera: &CameraName, standing: Standing) {
+    if standing == Standing::Excluded {
         tracing::warn!(
             "camera `{camera}` is left out: its bearings do not fit the tracks that the others hold; check its pose and its clock"
         );
@@ -327,9 +327,9 @@ fn report_camera(camera: &CameraName, standing: CameraTrust) {
 /// A camera's report as a wire message.
 fn camera_health(report: &CameraReport) -> CameraHealth {
     let standing = match report.standing {
-        CameraTrust::Good => crossfix_message::CameraStanding::Good,
-        CameraTrust::Doubted => crossfix_message::CameraStanding::Doubted,
-        CameraTrust::Excluded => crossfix_message::CameraStanding::Excluded,
+        Standing::Good => crossfix_message::CameraStanding::Good,
+        Standing::Doubted => crossfix_message::CameraStanding::Doubted,
+        Standing::Excluded => crossfix_message::CameraStanding::Excluded,
     };
     let clock = report.clock;
     CameraHealth {

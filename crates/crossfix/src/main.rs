@@ -63,7 +63,8 @@ struct Cli {
 
 fn main() -> ExitCode {
     network::give_zenoh_threads();
-    // clap handles wrong arguments itself, with exit code 2, and so does what it cannot see.
+    // clap handles wrong arguments itself, with exit code 2; contradictions that it cannot see end
+    // with 2, too.
     let cli = Cli::parse();
     logging::start(&cli.logging);
     match shutdown::supervise(move || cli.command.run()) {

@@ -78,6 +78,32 @@ fn numbers_that_nobody_can_mean_are_misuse() {
 }
 
 #[test]
+fn a_box_outside_the_image_is_no_target() {
+    let folder = tempfile::tempdir().unwrap();
+    let video = folder.path().join("grey.y4m");
+    let mut bytes = b"YUV4MPEG2 W64 H48 F30:1 Ip A1:1 Cmono\n".to_vec();
+    for _ in 0..3 {
+        bytes.extend_from_slice(b"FRAME\n");
+        bytes.extend_from_slice(&[128; 64 * 48]);
+    }
+    std::fs::write(&video, bytes).unwrap();
+    let table = folder.path().join("rows.csv");
+    let tracked = |place: &str| {
+        let path = [video.to_str().unwrap(), table.to_str().unwrap()];
+        let arguments = ["track", path[0], "--box", place, "--csv", path[1]];
+        crossfix().args(arguments).output().unwrap()
+    };
+    for place in ["500,500,10,10", "64,10,10,10", "-10,10,10,10"] {
+        let output = tracked(place);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.contains("lies outside the image of 64x48 pixels"), "{said}");
+        assert!(!table.exists());
+    }
+    assert!(tracked("60,10,10,10").status.success(), "a part of it lies inside");
+}
+
+#[test]
 fn an_error_is_a_line_and_its_causes() {
     let output = crossfix().args(["info", "no-such-file.mcap"]).output().unwrap();
     let stderr = String::from_utf8(output.stderr).unwrap();

@@ -7,11 +7,11 @@ use pathfinding::prelude::{Matrix, kuhn_munkres};
 /// Gains are quantised, as the solver needs totally ordered numbers: steps of a millionth. With
 /// half of it the same: gains are logarithms of likelihoods, and a millionth decides nothing.
 const STEPS: f64 = 1e6;
-/// Most pairs (all rows times all columns) of a cluster that is solved as a whole; a larger one is
-/// cut greedily: time is bounded. With half of it one of more than 100 rows and as many columns,
-/// and not only of more than 141, is cut, and targets close together may get one another's
-/// bearings.
-const MAX_KNOT: usize = 40_000;
+/// Most cells of the matrix (rows, by columns and rows) of a cluster that is solved as a whole; a
+/// larger one is cut greedily: time is bounded. With half of it one of more than 100 rows and as
+/// many columns, and not only of more than 141, is cut, and targets close together may get one
+/// another's bearings.
+const MOST_CELLS: usize = 40_000;
 
 /// A row and a column that may be paired, and the gain of that over leaving both alone.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -71,7 +71,7 @@ fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
         values
     };
     let (rows, columns) = (places(|c| c.row), places(|c| c.column));
-    if rows.len() * (columns.len() + rows.len()) > MAX_KNOT {
+    if rows.len() * (columns.len() + rows.len()) > MOST_CELLS {
         return greedy(cluster);
     }
     // Each row also has a column of its own where it gains nothing, so that it may stay alone.

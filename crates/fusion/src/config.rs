@@ -1,3 +1,6 @@
+//! The configuration of the fusion centre: what a site may set, with its defaults. The ranges are
+//! in `ranges.rs`.
+
 use crossfix_message::CameraName;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;

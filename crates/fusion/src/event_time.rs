@@ -63,12 +63,12 @@ struct Source {
 /// A camera that has been further behind than the lateness, for [`PATIENCES`] times as long, is not
 /// waited for: its frames come too late all the same.
 ///
-/// A camera's newest frame is its word that nothing older comes, so that nobody waits for an order
-/// that transports keep anyway. A camera whose word has cost a frame is taken, for a while, to be
+/// After a camera's newest frame nothing older is expected of it, so that nobody waits for an order
+/// that transports keep anyway. A camera that has lost a frame by that is taken, for a while, to be
 /// as far behind its newest frame as that one was.
 ///
-/// Whether a frame is late is decided not by that word but by what has been worked on: an exposure
-/// that can still be taken in order is taken.
+/// Whether a frame is late is decided not by that but by what has been worked on: an exposure that
+/// can still be taken in order is taken.
 #[derive(Debug)]
 pub(crate) struct EventBuffer {
     config: EventTime,
@@ -140,7 +140,7 @@ impl EventBuffer {
         if is_taken || self.waiting.holds(&exposure, time) {
             return Err(RejectionReason::Duplicate);
         }
-        let arrival = self.hear(&exposure);
+        let arrival = self.observe(&exposure);
         let compared = self.reference.is_some_and(|reference| reference.live > 1);
         if let Some(reference) = self.reference
             && let Some(stream) = self.stream_mut(&exposure.camera)
@@ -176,7 +176,7 @@ impl EventBuffer {
     }
 
     /// Notes an exposure's time, whatever becomes of the exposure.
-    fn hear(&mut self, exposure: &Exposure) -> ExposureArrival {
+    fn observe(&mut self, exposure: &Exposure) -> ExposureArrival {
         let (time, lateness_s) = (exposure.time, self.config.lateness_s);
         let late_s = self.late_s(exposure);
         let source = self.sources.entry(exposure.camera.clone()).or_default();
@@ -192,14 +192,14 @@ impl EventBuffer {
         let keeps_up = reached.is_none_or(|reached| time > reached);
         let step_s = time.seconds_since(stream.newest).clamp(0.0, lateness_s);
         stream.gone_s += stream.progress(keeps_up, step_s);
-        stream.hear(time, late_s, lateness_s);
+        stream.observe(time, late_s, lateness_s);
         self.go_on();
         let run_s = self.run_s;
         if let Some(stream) = self.stream_mut(&exposure.camera) {
             stream.heard_s = run_s;
         }
         self.first = Some(self.first.map_or(time, |first| first.min(time)));
-        self.refer();
+        self.estimate_now();
         self.note_who_is_behind();
         arrival
     }
@@ -234,7 +234,7 @@ impl EventBuffer {
     }
 
     /// Computes the reference from the live cameras.
-    fn refer(&mut self) {
+    fn estimate_now(&mut self) {
         let patience_s = PATIENCES * self.config.lateness_s;
         let is_live = |stream: &&Stream| self.run_s - stream.heard_s <= patience_s;
         let live: Vec<&Stream> = self.going_on().filter(is_live).collect();
@@ -302,7 +302,7 @@ impl EventBuffer {
     }
 
     /// Notes that an exposure of this time, less the clock's offset, is being worked on.
-    pub(crate) fn pass(&mut self, corrected: Timestamp) {
+    pub(crate) fn mark_processed(&mut self, corrected: Timestamp) {
         self.passed = self.passed.max(corrected);
     }
 

@@ -1,3 +1,13 @@
+//! The fusion centre as a state machine: bearing frames in, track frames, events and cues out.
+//!
+//! The way of a frame, in the order of the calls: read into an exposure (`ingress.rs`), its clock
+//! corrected (`clocks/`, `fusion/correcting.rs`), put in order (`event_time.rs`), its bearings given
+//! to the tracks that they fit (`tracker/`), the rest to new ones (`initiation/`); what the exposure
+//! shows of its camera (`cameras/`), and what is said of it all (`fusion/saying.rs`).
+//!
+//! It has no clock, thread or file, so that a recording gives the tracks of the live run, bit for
+//! bit.
+
 mod correcting;
 mod jumps;
 mod saying;
@@ -10,7 +20,7 @@ use crossfix_message::{
     TrackFrame,
 };
 
-use crate::cameras::{CameraTrust, Cameras, Fittings, KnownCamera, PoseFinding, ScaleSample};
+use crate::cameras::{Cameras, Fittings, KnownCamera, PoseFinding, ScaleSample, Standing};
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::cueing::Cueing;
 use crate::event_time::{EventBuffer, ExposureArrival, ReorderQueue};
@@ -42,7 +52,7 @@ pub enum Output {
     /// A frame, or a part of one, was not used.
     Rejected(Rejection),
     /// A camera is excluded, or used again.
-    Camera(CameraName, CameraTrust),
+    Camera(CameraName, Standing),
 }
 
 /// The fusion centre's judgement of a camera.
@@ -51,7 +61,7 @@ pub struct CameraReport {
     /// The camera.
     pub camera: CameraName,
     /// How far its bearings are believed.
-    pub standing: CameraTrust,
+    pub standing: Standing,
     /// Factor by which its reported covariances are multiplied.
     pub noise_factor: f64,
     /// Its clock; `None` until the camera has been heard.
@@ -298,7 +308,7 @@ impl Fusion {
 
     /// Handles one exposure; they come in the order of capture times.
     fn process(&mut self, exposure: &Exposure, outputs: &mut Vec<Output>) {
-        self.buffer.pass(exposure.time);
+        self.buffer.mark_processed(exposure.time);
         self.now = Some(exposure.time);
         self.tracker.begin(exposure.time);
         for moved in self.cameras.advance(exposure.time) {
@@ -410,7 +420,7 @@ impl Fusion {
         }
         if let Some(standing) = judgement.standing {
             self.counters.count(match standing {
-                CameraTrust::Excluded => "cameras_excluded",
+                Standing::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
             });
             outputs.push(Output::Camera(exposure.camera.clone(), standing));
@@ -427,11 +437,11 @@ impl Fusion {
     ) {
         let changed = self.cameras.get_mut(camera).and_then(|known| known.note_time(time, in_time));
         if let Some(standing) = changed {
-            if standing == CameraTrust::Excluded {
+            if standing == Standing::Excluded {
                 self.site_time.doubt(camera);
             }
             self.counters.count(match standing {
-                CameraTrust::Excluded => "cameras_out_of_time",
+                Standing::Excluded => "cameras_out_of_time",
                 _ => "cameras_in_time_again",
             });
             outputs.push(Output::Camera(camera.clone(), standing));

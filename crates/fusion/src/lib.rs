@@ -78,7 +78,7 @@ mod unmet;
 mod update;
 mod visibility;
 
-pub use cameras::{CameraTrust, PoseFinding};
+pub use cameras::{PoseFinding, Standing};
 pub use clocks::ClockEstimate;
 pub use config::{
     Bearings, Clocks, EventTime, FlightModel, FusionConfig, FusionConfigError, Initiation,

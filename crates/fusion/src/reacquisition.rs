@@ -1,8 +1,7 @@
 //! Re-acquisition: a second camera sees the target of a track that one camera alone follows. Any of
 //! its bearings that crosses the sight line may be the target's, so each is followed as a
-//! hypothesis of its own (a leaf) until one is sure.
-//!
-//! "Strangers" are bearings of other objects or of nothing: clutter.
+//! hypothesis of its own (a leaf) until one is sure. All others, of other objects or of nothing, are
+//! clutter.
 
 use std::collections::BTreeMap;
 
@@ -14,20 +13,20 @@ use crate::track::{Track, TrackId};
 use crate::visibility::log_missed;
 use crate::{Exposure, Tracking};
 
-/// A leaf replaces the track when its bearings are likelier the target's than strangers by this
+/// A leaf replaces the track when its bearings are likelier the target's than clutter by this
 /// log-likelihood ratio: a chance of 1 in 3000. Half of it would settle one re-acquisition in 50 on
-/// a stranger.
+/// clutter.
 pub(crate) const FOUND_AGAIN_MARGIN: f64 = 8.0;
 /// A leaf whose log-likelihood ratio falls to this is given up. With half of it one miss ends a
 /// leaf of even odds; as it is, two do.
 const GIVEN_UP: f64 = -3.0;
-/// Most leaves of one track at a time, the best ones: memory is bounded however many strangers
-/// there are. With half of it, where more of them cross the sight line, the target's own leaf may
+/// Most leaves of one track at a time, the best ones: memory is bounded however much clutter
+/// there is. With half of it, where more of them cross the sight line, the target's own leaf may
 /// be dropped before it is sure.
 const MAX_LEAVES: usize = 4;
 
 /// A copy of the track that has used bearings of a second camera, with the log-likelihood ratio of
-/// these being the target's against being strangers.
+/// these being the target's against being clutter.
 #[derive(Clone, Debug)]
 struct Leaf {
     track: Track,
@@ -54,7 +53,7 @@ pub(crate) struct ReacquisitionContext<'a> {
 
 impl ReacquisitionContext<'_> {
     /// The sightings (by index) in a track's gate, with their log-likelihood ratios against
-    /// strangers, the best first.
+    /// clutter, the best first.
     fn fits(&self, track: &Track, owner: TrackId) -> Vec<(f64, usize)> {
         let Self { exposure, known, motion, config, .. } = self;
         let (camera, origin) = (&exposure.camera, known.camera.pose().position());

@@ -41,13 +41,14 @@ const SHARE_OF_LATENESS: f64 = 0.5;
 const SHARE_OF_STEP: f64 = 0.5;
 /// Bounds on what waits. Beyond them each clock is taken to have stepped for itself: with half of
 /// them thirty cameras of 30 Hz have 0.1 s to show that all have stepped, and not 0.2 s.
-struct Most {
+struct WaitingBounds {
+    /// Frames of all cameras.
     frames: usize,
     /// Bearings in all of them.
     bearings: usize,
 }
 
-const MOST: Most = Most { frames: 200, bearings: 20_000 };
+const BOUNDS: WaitingBounds = WaitingBounds { frames: 200, bearings: 20_000 };
 
 /// A frame as stamped by a clock that is `ahead_s` ahead of its camera's.
 pub(crate) fn moved(frame: &BearingFrame, ahead_s: f64) -> BearingFrame {
@@ -349,7 +350,7 @@ impl SiteTime {
             rhythm.gone_s - pending.gone_s.get(name).copied().unwrap_or(0.0)
         };
         let bearings: usize = pending.frames.iter().map(|frame| frame.tracks.len()).sum();
-        let is_full = pending.frames.len() >= MOST.frames || bearings > MOST.bearings;
+        let is_full = pending.frames.len() >= BOUNDS.frames || bearings > BOUNDS.bearings;
         let is_late = self.live().map(gone_s).fold(0.0, f64::max) > self.longest_s;
         (is_full || is_late || self.live().count() < 2).then_some(None)
     }

@@ -1,3 +1,14 @@
+//! One target's track: a filter of position and velocity that single bearings of single cameras
+//! update, and what it knows of the cameras' errors.
+//!
+//! Errors of pose and clock shift all bearings of a camera alike, so they do not average out. They
+//! are not part of the state, but their covariance with it is kept (`track/ties.rs`, Schmidt); the
+//! errors that last for about a second are estimated with the state (`track/learnt.rs`).
+//!
+//! Coordinates follow from how many cameras see the target now: Cartesian for two and more, range
+//! coordinates about the camera that alone sees it (`range_chart.rs`), as there the range that no
+//! bearing holds is one axis.
+
 mod expectation;
 mod information;
 mod innovation;
@@ -110,9 +121,10 @@ pub struct Track {
     pub observability: Observability,
     /// When [`Self::observability`] was computed last.
     observed: Timestamp,
-    /// Whether two cameras have seen it lately, so that its range is known: see [`Self::is_held`].
+    /// Whether two cameras have seen it lately: see [`Self::is_held`].
     held: bool,
-    /// Whether two cameras see it now, so that its motion is observed along every axis.
+    /// Whether two cameras see it now, so that its range is observed and its motion along every axis:
+    /// this decides about coordinates. A track that is held is not always ranged.
     ranged: bool,
     /// When the track began.
     pub(crate) born: Timestamp,
@@ -434,8 +446,9 @@ impl Track {
         }
     }
 
-    /// Whether two cameras have lately seen the target. With only one the range is unobserved, and
-    /// the track may drift along its sight line.
+    /// Whether two cameras have lately supported the track, within 1.5 s or so. With only one since
+    /// then the range has been unobserved for long, and the track may have drifted along its sight
+    /// line.
     pub fn is_held(&self) -> bool {
         self.held
     }

@@ -13,7 +13,7 @@ use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, ScaleSample, T
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::reacquisition::{Reacquisition, ReacquisitionContext};
-use crate::track::{Track, TrackId, TrackStatus};
+use crate::track::{Track, TrackExpectation, TrackId, TrackStatus};
 
 use association::fitting;
 
@@ -186,18 +186,22 @@ impl Tracker {
         exposure: &Exposure,
         known: &KnownCamera,
     ) -> Option<usize> {
-        let (camera, origin) = (&exposure.camera, known.camera.pose().position());
-        let expected = track.expectation(
-            exposure.time,
-            camera,
-            origin,
-            &exposure.uncertainty,
-            &self.motion,
-        )?;
+        let expected = self.expectation(track, exposure, known)?;
         let fits = exposure.sightings.iter().enumerate();
         let fits =
             fits.filter_map(|(i, s)| Some((expected.fit(&s.line, self.gate)?.gate_distance, i)));
         fits.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, nearest)| nearest)
+    }
+
+    /// The predicted bearing of a track in an exposure.
+    fn expectation(
+        &self,
+        track: &Track,
+        exposure: &Exposure,
+        known: &KnownCamera,
+    ) -> Option<TrackExpectation> {
+        let (camera, origin) = (&exposure.camera, known.camera.pose().position());
+        track.expectation(exposure.time, camera, origin, &exposure.uncertainty, &self.motion)
     }
 
     /// How targets move.
@@ -227,15 +231,8 @@ impl Tracker {
     /// How well an exposure fits the confirmed tracks: the sum over the tracks of the best
     /// log-likelihood ratio, of a bearing being this track's against being clutter.
     pub(crate) fn fit(&self, exposure: &Exposure, known: &KnownCamera) -> f64 {
-        let (camera, origin) = (&exposure.camera, known.camera.pose().position());
         let best = |track: &Track| {
-            let expected = track.expectation(
-                exposure.time,
-                camera,
-                origin,
-                &exposure.uncertainty,
-                &self.motion,
-            )?;
+            let expected = self.expectation(track, exposure, known)?;
             let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
             // ln(N / clutter), P_D left out: it is the same for both times that are compared.
             fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)

@@ -40,7 +40,7 @@ const MAX_APART_S: f64 = 0.5;
 /// it the same.
 const SAME_PLACE_M: f64 = 1e-3;
 /// Bounds on time and memory.
-struct Most {
+struct ComparedBounds {
     /// Lines of one exposure that are compared. With half of it the one target among twenty image
     /// tracks may not be compared.
     lines: usize,
@@ -49,7 +49,7 @@ struct Most {
     image_tracks: usize,
 }
 
-const MOST: Most = Most { lines: 30, image_tracks: 1_000 };
+const BOUNDS: ComparedBounds = ComparedBounds { lines: 30, image_tracks: 1_000 };
 
 /// Why no target is found.
 #[derive(Clone, Debug, PartialEq)]
@@ -300,13 +300,13 @@ impl Unmet {
         for (Sighting { image_track, rooted, .. }, (_, timed)) in
             exposure.sightings.iter().zip(lines_with_pose(exposure))
         {
-            let full = seen.since.len() >= MOST.image_tracks;
+            let full = seen.since.len() >= BOUNDS.image_tracks;
             if *rooted == Rooted::Yes || (full && !seen.since.contains_key(image_track)) {
                 continue;
             }
             let (first, last) = seen.since.entry(*image_track).or_insert((now, now));
             *last = now;
-            if now.seconds_since(*first) >= SOMETHING_S && lines.len() < MOST.lines {
+            if now.seconds_since(*first) >= SOMETHING_S && lines.len() < BOUNDS.lines {
                 lines.push(timed);
             }
         }

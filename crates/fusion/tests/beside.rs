@@ -28,8 +28,10 @@ const CLOCK_SD_S: f64 = 0.015;
 struct Shown {
     /// Distances of the tracks from the target, m.
     off: Vec<f64>,
-    /// How many of them are more than four of the deviations that the tracks state.
+    /// How many of them are more than four of the deviations that the tracks state, ...
     beyond: usize,
+    /// ... and the largest, in these deviations.
+    largest: f64,
     /// Errors of the clocks' estimates, s.
     clocks_s: Vec<f64>,
 }
@@ -43,6 +45,7 @@ impl Shown {
             let stated = track.state().position_covariance().trace().sqrt();
             self.off.push(off);
             self.beyond += usize::from(off > 4.0 * stated);
+            self.largest = self.largest.max(off / stated);
         }
     }
 }
@@ -109,21 +112,21 @@ fn flown(cameras: usize) -> Shown {
 /// The lines of two cameras miss the target by 0.45 m each, at 150 m. That was once explained by
 /// clocks that jumped by up to half a second, and a track ran away by 26 m.
 ///
-/// The bounds leave room for other seeds: in one flight of twenty the line of one of two cameras
-/// lies outside the gate for some seconds, and the track of the other is as far off as it says; in
-/// one of fifty a clock is off by a fifth of a second for a moment.
+/// Twenty-four other flights gave up to 10 deviations at most before two cameras, and 5.3 before
+/// three.
 #[test]
 fn no_track_runs_away_and_no_clock() {
-    for (cameras, rmse_m, beyond) in [(2, 1.3, 0.05), (3, 0.85, 0.01)] {
+    for (cameras, rmse_m, beyond, largest) in [(2, 1.0, 0.04, 12.0), (3, 0.75, 0.003, 6.0)] {
         let shown = flown(cameras);
         let share = shown.beyond as f64 / shown.off.len() as f64;
         let (off_m, clocks_s) = (root_mean_square(&shown.off), root_mean_square(&shown.clocks_s));
         let line = format!(
-            "{cameras} cameras: {off_m:.2} m, {:.2} % beyond 4 SD, clocks {clocks_s:.4} s",
+            "{cameras} cameras: {off_m:.2} m, {:.2} % beyond 4 SD, {:.1} at most, clocks {clocks_s:.4} s",
             100.0 * share,
+            shown.largest
         );
         println!("{line}");
-        assert!(off_m < rmse_m && share < beyond, "{line}");
+        assert!(off_m < rmse_m && share < beyond && shown.largest < largest, "{line}");
         assert!(clocks_s < CLOCK_SD_S, "{line}");
     }
 }

@@ -8,7 +8,7 @@ mod common;
 use common::{Eye, Scene, eye, found, fusion_of, site, straight};
 use std::collections::BTreeMap;
 
-use crossfix_fusion::{CameraTrust, ClockEstimate, Clocks, Fusion, FusionConfig, Output};
+use crossfix_fusion::{ClockEstimate, Clocks, Fusion, FusionConfig, Output, Standing};
 use crossfix_geometry::{Camera, Pose, tangent_basis};
 use crossfix_message::{BearingFrame, CameraCalibration, CameraName, LastingNoise, Timestamp};
 use nalgebra::{Matrix6, Point3, Rotation3, Unit, Vector2, Vector3};
@@ -149,14 +149,14 @@ fn a_camera_that_was_knocked_is_left_out_and_comes_back_when_it_is_straightened(
         }
         fusion.ingest(&frame);
         if (14.8..15.0).contains(&time) {
-            assert_eq!(standing(&fusion), CameraTrust::Good);
+            assert_eq!(standing(&fusion), Standing::Good);
         }
         if (34.8..35.0).contains(&time) {
-            assert_eq!(standing(&fusion), CameraTrust::Excluded);
+            assert_eq!(standing(&fusion), Standing::Excluded);
         }
     }
     fusion.flush();
-    assert_eq!(standing(&fusion), CameraTrust::Good);
+    assert_eq!(standing(&fusion), Standing::Good);
     assert_eq!(fusion.counters().get("cameras_excluded"), 1);
     assert_eq!(fusion.counters().get("cameras_readmitted"), 1);
     assert!(found(&fusion, &scene.paths[0]).is_some());
@@ -179,10 +179,10 @@ fn a_camera_worse_than_it_says_counts_less() {
     }
     let reports: Vec<_> = fusion.cameras().collect();
     let worse = reports.iter().find(|report| report.camera.as_str() == "c").unwrap();
-    assert_eq!(worse.standing, CameraTrust::Doubted);
+    assert_eq!(worse.standing, Standing::Doubted);
     assert!((7.5..11.0).contains(&worse.noise_factor), "{worse:?}");
     let others = reports.iter().filter(|report| report.camera.as_str() != "c");
-    assert!(others.clone().all(|report| report.standing == CameraTrust::Good), "{reports:?}");
+    assert!(others.clone().all(|report| report.standing == Standing::Good), "{reports:?}");
 }
 
 /// The calibration of a camera whose pose is off by deviations of its rotation (rad) and place (m)

@@ -12,7 +12,7 @@ mod tally;
 
 use bound::{Way, bound};
 use common::{Path, Scene, found, fusion_of, site, straight};
-use crossfix_fusion::{CameraTrust, ClockEstimate, Fusion, FusionConfig, Output};
+use crossfix_fusion::{ClockEstimate, Fusion, FusionConfig, Output, Standing};
 use crossfix_message::Timestamp;
 use nalgebra::{Point3, Vector3};
 use paths::{
@@ -285,7 +285,7 @@ fn a_clock_that_loses_its_source_of_time_and_says_so_is_learnt_from_then_on() {
             error.abs() < 3.5 * d.relative_sd_s.hypot(a.relative_sd_s),
             "{others_sd_s}: {a:?} {d:?}"
         );
-        assert!(fusion.cameras().all(|report| report.standing != CameraTrust::Excluded));
+        assert!(fusion.cameras().all(|report| report.standing != Standing::Excluded));
     }
 }
 

@@ -144,8 +144,7 @@ fn what_a_target_does_along_the_last_cameras_sight_line_lies_within_what_is_clai
                 frame.tracks.clear();
             }
             fusion.ingest(&frame);
-            // That the others are silent for good shows after 1.5 s.
-            for track in fusion.tracks().filter(|track| track.is_confirmed() && time > 10.6) {
+            for track in fusion.tracks().filter(|track| track.is_confirmed() && time > 9.0) {
                 let error = track.state().position() - path()(track.updated.seconds()).unwrap();
                 let spread = track.state().position_covariance().cholesky().unwrap();
                 far_off += usize::from(error.dot(&spread.solve(&error)) > 16.0);

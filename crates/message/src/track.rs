@@ -49,7 +49,14 @@ impl fmt::Display for TrackNumber {
     }
 }
 
-/// What happened to which track, for people: `track 3 merged into 1`.
+/// What happened to which track, for people.
+///
+/// ```
+/// use crossfix_message::{TrackEvent, TrackEventKind};
+/// let kind = TrackEventKind::Merged.into();
+/// let event = TrackEvent { kind, track_id: 3, other_id: 1, ..Default::default() };
+/// assert_eq!(event.to_string(), "track 3 merged into 1");
+/// ```
 impl fmt::Display for TrackEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let happened = match self.kind() {
@@ -58,7 +65,7 @@ impl fmt::Display for TrackEvent {
             TrackEventKind::Confirmed => "confirmed",
             TrackEventKind::Lost => "lost",
             TrackEventKind::Merged => "merged",
-            TrackEventKind::Manoeuvre => "manoeuvres",
+            TrackEventKind::Manoeuvre => "began to manoeuvre",
         };
         write!(f, "track {} {happened}", TrackNumber(self.track_id))?;
         match self.other_id {

@@ -70,7 +70,7 @@ pub use target::Target;
 
 /// Why the other side does not take our messages.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
-pub enum OtherSideRefuses {
+pub enum OutletRefusal {
     /// It refuses this site.
     #[error("it refuses this site: {0}")]
     Registration(String),
@@ -98,8 +98,8 @@ pub trait Outlet {
     /// Takes what the other side sends.
     ///
     /// # Errors
-    /// [`OtherSideRefuses`] if the other side takes nothing: the connection is useless then.
-    fn heard(&mut self, _bytes: &[u8]) -> Result<(), OtherSideRefuses> {
+    /// [`OutletRefusal`] if the other side takes nothing: the connection is useless then.
+    fn heard(&mut self, _bytes: &[u8]) -> Result<(), OutletRefusal> {
         Ok(())
     }
 

@@ -7,7 +7,7 @@ use sapient_rs::bsi_flex_335_v2_0 as sapient;
 use sha2::{Digest, Sha256};
 
 use crate::text::state;
-use crate::{OtherSideRefuses, Outlet, Snapshot, Target};
+use crate::{Outlet, OutletRefusal, Snapshot, Target};
 
 /// The interface's version, spelt as its validators require.
 const VERSION: &str = "BSI Flex 335 v2.0";
@@ -117,12 +117,12 @@ impl Sapient {
     }
 
     /// Takes the complete frames out of the inbox.
-    fn whole_frames(&mut self) -> Result<Vec<Vec<u8>>, OtherSideRefuses> {
+    fn whole_frames(&mut self) -> Result<Vec<Vec<u8>>, OutletRefusal> {
         let mut frames = Vec::new();
         while let Some((head, rest)) = self.inbox.split_first_chunk::<4>() {
             let length = u32::from_le_bytes(*head) as usize;
             if length > MOST_FRAME_BYTES {
-                return Err(OtherSideRefuses::Malformed(format!("a message of {length} bytes")));
+                return Err(OutletRefusal::Malformed(format!("a message of {length} bytes")));
             }
             let Some(frame) = rest.get(..length) else { break };
             frames.push(frame.to_vec());
@@ -296,16 +296,14 @@ impl Outlet for Sapient {
 
     /// Takes in the answer to the registration. Tasks and other messages are ignored: they are for
     /// nodes that can be steered.
-    fn heard(&mut self, bytes: &[u8]) -> Result<(), OtherSideRefuses> {
+    fn heard(&mut self, bytes: &[u8]) -> Result<(), OutletRefusal> {
         self.inbox.extend(bytes);
         for frame in self.whole_frames()? {
             let message = sapient::SapientMessage::decode(frame.as_slice())
-                .map_err(|error| OtherSideRefuses::Malformed(error.to_string()))?;
+                .map_err(|error| OutletRefusal::Malformed(error.to_string()))?;
             if let Some(Content::RegistrationAck(answer)) = message.content {
                 if answer.acceptance == Some(false) {
-                    return Err(OtherSideRefuses::Registration(
-                        answer.ack_response_reason.join("; "),
-                    ));
+                    return Err(OutletRefusal::Registration(answer.ack_response_reason.join("; ")));
                 }
                 self.is_registered = true;
             }
@@ -402,11 +400,8 @@ mod tests {
         assert!(!sapient.is_ready());
         sapient.heard(&yes[7..]).unwrap();
         assert!(sapient.is_ready());
-        assert_eq!(
-            sapient.heard(&ack(false)),
-            Err(OtherSideRefuses::Registration("no".to_owned()))
-        );
+        assert_eq!(sapient.heard(&ack(false)), Err(OutletRefusal::Registration("no".to_owned())));
         let endless = sapient.heard(&[0xff; 8]);
-        assert!(matches!(endless, Err(OtherSideRefuses::Malformed(_))), "{endless:?}");
+        assert!(matches!(endless, Err(OutletRefusal::Malformed(_))), "{endless:?}");
     }
 }

@@ -23,6 +23,52 @@
 //! A receiver whose connection is lost blocks one of Zenoh's receiving threads for up to ten
 //! seconds, and by default Zenoh has two. A program should give it more before its first thread is
 //! started, as `crossfix` does by the variable `ZENOH_RUNTIME`.
+//!
+//! # Example
+//!
+//! A camera and an observer on one computer:
+//!
+//! ```
+//! use std::collections::BTreeMap;
+//! use std::time::Duration;
+//!
+//! use crossfix_message::{BearingFrame, Channel, Payload, decode};
+//! use crossfix_transport::{Delivery, Link, Mode, NetworkConfig, Role};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! # let free = || -> std::io::Result<String> {
+//! #     Ok(format!("tcp/{}", std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?))
+//! # };
+//! let network = NetworkConfig {
+//!     site: "field".parse()?,
+//!     mode: Mode::Peer,
+//!     routers: Vec::new(),
+//!     unsecured: false,
+//!     security: None,
+//!     anchor: None,
+//!     fusion: Some(free()?),
+//!     areas: BTreeMap::new(),
+//!     cameras: BTreeMap::from([("north".parse()?, free()?)]),
+//! };
+//! let north = Link::open(&network, &Role::Camera("north".parse()?))?;
+//! let _alive = north.declare_alive(Channel::Alive("north".parse()?))?;
+//! let bearings = Channel::Bearings("north".parse()?);
+//! let publisher = north.publisher(bearings.clone(), Delivery::Queued)?;
+//!
+//! let observer = Link::open(&network, &Role::Observer)?;
+//! let subscription = observer.subscribe(&[observer.key(bearings).to_string()])?;
+//! observer.wait_for(&[Channel::Alive("north".parse()?)], Duration::from_secs(10), || true)?;
+//!
+//! // A subscription takes a moment to reach the publisher: what is sent before is lost.
+//! let received = (0..100).find_map(|sequence| {
+//!     let frame = BearingFrame { camera: "north".to_owned(), sequence, ..Default::default() };
+//!     publisher.put(frame.encode()).ok()?;
+//!     subscription.next(Duration::from_millis(100))
+//! });
+//! let frame: BearingFrame = decode(&received.ok_or("nothing came")?.data)?;
+//! assert_eq!(frame.camera, "north");
+//! # Ok(()) }
+//! ```
 
 mod config;
 mod error;

@@ -52,4 +52,4 @@ pub use picture::Picture;
 pub use rerun::RecordingStream;
 pub use sink::{ViewError, ViewerWatch, connect, save, save_without_end, spawn_viewer};
 pub use tracking::{FollowedTarget, ImageBox, Sight, TrackingPicture};
-pub use volume::{DrawnLandmark, VolumeCell, VolumePicture};
+pub use volume::{DrawnPlace, VolumeCell, VolumePicture};

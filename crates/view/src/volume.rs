@@ -31,7 +31,7 @@ pub struct VolumeCell {
 
 /// A place with a standard deviation, which is coloured by the same scale.
 #[derive(Clone, Debug, PartialEq)]
-pub struct DrawnLandmark {
+pub struct DrawnPlace {
     /// The place, world, m.
     pub place: Point3<f64>,
     /// The standard deviation, m.
@@ -49,7 +49,7 @@ pub struct VolumePicture<'a> {
     /// Side of a cube, m.
     pub side_m: f64,
     /// Other places of interest.
-    pub landmarks: Vec<DrawnLandmark>,
+    pub landmarks: Vec<DrawnPlace>,
     /// Description of what is shown (Markdown).
     pub legend: String,
 }
@@ -139,7 +139,7 @@ impl VolumePicture<'_> {
     }
 
     fn landmarks(&self, stream: &RecordingStream, scale: &Scale) -> Result<(), ViewError> {
-        let (named, plain): (Vec<&DrawnLandmark>, Vec<&DrawnLandmark>) =
+        let (named, plain): (Vec<&DrawnPlace>, Vec<&DrawnPlace>) =
             self.landmarks.iter().partition(|landmark| landmark.label.is_some());
         for (path, landmarks, radius) in
             [("world/candidates/named", named, 8.0), ("world/candidates/others", plain, 3.0)]

@@ -1,3 +1,5 @@
+//! The configuration of the image tracker: what may be set, with its defaults and ranges.
+
 use crossfix_correlation::{Extent, Similarity, SpectralWeight};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;

@@ -1,3 +1,9 @@
+//! The likelihood of every placement of the reference: how much likelier the pixels are with the
+//! target there than without it, from the correlation and the statistics of the pixels below it.
+//!
+//! Contrast is not known but has a prior, and is integrated out; that keeps a bright cloud, which
+//! correlates as well, from being as likely as the target.
+
 use crossfix_correlation::{Plane, Statistics};
 use pulp::{Arch, Simd, WithSimd};
 

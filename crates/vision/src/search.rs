@@ -36,7 +36,7 @@ pub(crate) struct ClearFind {
     above_chance: f64,
 }
 
-pub(crate) const CLEAR: ClearFind =
+pub(crate) const CLEAR_FIND: ClearFind =
     ClearFind { least_ratio: 3.0, least_margin: 1.0, above_chance: 4.0 };
 /// Variance of the noise in the picture of what has changed, over that in the image: the image's
 /// own noise, and what interpolation leaves of the older picture's. With half of it noise looks
@@ -176,9 +176,9 @@ impl Sought<'_> {
         // A noisy reference finds the target fainter than it is, by the clear share.
         let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
         let likelier = searched.likeness.log_ratio(peak.contrast, usual, frame.config.contrast_sd);
-        let is_clear = peak.log_ratio - background > CLEAR.least_ratio
-            && best.margin > CLEAR.least_margin
-            && likelier > CLEAR.above_chance;
+        let is_clear = peak.log_ratio - background > CLEAR_FIND.least_ratio
+            && best.margin > CLEAR_FIND.least_margin
+            && likelier > CLEAR_FIND.above_chance;
         (is_clear && self.has_come(frame, &fit, scratch)).then_some(fit)
     }
 

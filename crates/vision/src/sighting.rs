@@ -5,7 +5,7 @@ use crate::fit::TargetFit;
 use crate::followed_target::Target;
 use crate::frame::{FrameInput, TargetStep};
 use crate::scratch::Scratch;
-use crate::search::CLEAR;
+use crate::search::CLEAR_FIND;
 
 /// Largest ratio of the sides of what is found to the target's, either way: outlines lose what is
 /// as bright as the sky behind it. With half of it a panning camera's target is right in 96.5 % of
@@ -86,7 +86,7 @@ impl Target {
         );
         let fit = self.state.fit_at(peak.column, peak.row, peak.origin, scratch, frame.config);
         let has_come = self.state.appearance.clear_share() > LEAST_CLEAR
-            && peak.log_ratio > CLEAR.least_ratio
+            && peak.log_ratio > CLEAR_FIND.least_ratio
             && self.identity.arrival_log_ratio(&self.state, frame, fit.place, scratch) >= 0.0;
         has_come.then_some(SightingOfLost { fit, log_ratio: peak.log_ratio, as_at_first: false })
     }

@@ -16,13 +16,13 @@ use crate::motion::ImageMotion;
 use crate::scratch::Scratch;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
-/// Images without the target after which it is searched for: what noise hides is another in each
-/// image. With one, each blurred image begins a search; with six a lost target runs on with its
+/// Images without the target after which it is searched for: noise hides it in one image and not
+/// in the next. With one, each blurred image begins a search; with six a lost target runs on with its
 /// prediction for 0.1 s longer, at thirty images a second. (A limit of 0.09 s, which is one image
 /// at ten a second, loses a fifth more frames there.)
 const SEARCH_AFTER_IMAGES: u32 = 3;
 /// Time constant of the running estimate of an image's noise, s. With half of it the noise in front
-/// of another background is known after 0.05 s, and a single image's counts half as much again.
+/// of another background is known after 0.05 s, and a single image's counts 1.7 times as much.
 const NOISE_S: f64 = 0.0935;
 /// Certainty above which a target counts as seen. With half of it a target is measured where it is
 /// likelier not to be.

@@ -1,3 +1,9 @@
+//! All targets of one camera's images: those that it is given, and those that the detector finds.
+//!
+//! What all targets of an image need is made once: the picture of the scene, the detector's
+//! background, the map of what has changed. One lost target is searched for in an image, by turns,
+//! so that it costs the others nothing.
+
 use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
 use nalgebra::Matrix2;

@@ -8,7 +8,6 @@ use nalgebra::Vector3;
 use crate::calibrated;
 use crate::config::{self, CameraFile, FileKind, SiteFolder, load_network};
 use crate::output;
-#[cfg(not(feature = "centre"))]
 use crate::parts;
 
 /// Check configuration files before anything starts, and print what they resolve to.
@@ -110,6 +109,9 @@ fn check_camera(args: &Args) -> anyhow::Result<String> {
     file.check_pictures(&camera).with_context(|| args.config.display().to_string())?;
     load_network(&file.network).context("key `network`")?;
     tracing::info!("camera `{}`: {}", file.name, view_of(&camera));
+    if parts::DECODES_SLOWLY && file.source.has_video() {
+        tracing::info!("{}", parts::WITH_NASM);
+    }
     Ok(toml::to_string(&file)?)
 }
 

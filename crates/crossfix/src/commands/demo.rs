@@ -54,7 +54,7 @@ pub struct Args {
     #[arg(long, default_value_t = 1, value_name = "N")]
     seed: u64,
     /// How long the scene lasts, seconds.
-    #[arg(long, default_value_t = 25.0, value_name = "SECONDS", value_parser = numbers::scene_seconds,
+    #[arg(long, default_value_t = 25.0, value_name = "SECONDS", value_parser = numbers::demo_seconds,
           allow_negative_numbers = true)]
     duration: f64,
     /// The folder to write recording, picture, configurations and logs to.
@@ -219,20 +219,23 @@ fn play(
     network: &NetworkConfig,
     shutdown: &Shutdown,
 ) -> anyhow::Result<Ending> {
-    let centre = Centre::start(args, files)?;
+    let centre = CentreProcesses::start(args, files)?;
     let link = Link::open(network, &Role::Observer)?;
     let subscription = link.subscribe(&[link.key(Channel::Tracks).to_string()])?;
     let go_on = || !shutdown.requested();
     link.wait_for(&[Channel::FusionAlive], PATIENCE, go_on)
         .context("the fusion centre did not come up")?;
     let begins_at = wall_seconds() + RUN_UP_S;
-    let mut cameras = Cameras::start(files, begins_at)?;
+    let mut cameras = CameraProcesses::start(files, begins_at)?;
     let bar = progress_bar(args.duration);
     let mut ending = Ending::Complete;
     let mut tracks = BTreeMap::new();
-    while cameras.play(&files.folder)? {
+    loop {
+        let goes_on = cameras.go_on(&files.folder)?;
         if shutdown.requested() {
             ending = Ending::Interrupted;
+        }
+        if !goes_on || ending == Ending::Interrupted {
             break;
         }
         let elapsed = (wall_seconds() - begins_at).clamp(0.0, args.duration);
@@ -250,13 +253,13 @@ fn play(
 }
 
 /// What hears the cameras.
-struct Centre {
+struct CentreProcesses {
     recorder: Component,
     fusion: Component,
     viewer: Option<Component>,
 }
 
-impl Centre {
+impl CentreProcesses {
     fn start(args: &Args, files: &DemoFiles) -> anyhow::Result<Self> {
         let start =
             |name: &str, arguments: &[&str]| Component::start(name, &files.folder, arguments);
@@ -272,14 +275,14 @@ impl Centre {
 }
 
 /// The processes that stand for the cameras.
-struct Cameras {
+struct CameraProcesses {
     /// They end with the scene: its agents, or the cameras whose streams agents watch.
     players: Vec<Component>,
     /// Agents that watch a stream: they go on after it has ended.
     watchers: Vec<Component>,
 }
 
-impl Cameras {
+impl CameraProcesses {
     fn start(files: &DemoFiles, begins_at: f64) -> anyhow::Result<Self> {
         let begin = format!("{begins_at:.6}");
         let mut agents = Vec::new();
@@ -299,7 +302,7 @@ impl Cameras {
     }
 
     /// Whether the scene goes on; an error if a process has failed.
-    fn play(&mut self, folder: &Path) -> anyhow::Result<bool> {
+    fn go_on(&mut self, folder: &Path) -> anyhow::Result<bool> {
         for watcher in &mut self.watchers {
             watcher.runs(folder)?;
         }
@@ -315,9 +318,13 @@ impl Cameras {
 }
 
 /// Stops all components, those that send first.
-fn stop_all(centre: Centre, cameras: Cameras, ending: Ending) -> anyhow::Result<()> {
-    let Centre { mut recorder, mut fusion, viewer } = centre;
-    let Cameras { mut players, mut watchers } = cameras;
+fn stop_all(
+    centre: CentreProcesses,
+    cameras: CameraProcesses,
+    ending: Ending,
+) -> anyhow::Result<()> {
+    let CentreProcesses { mut recorder, mut fusion, viewer } = centre;
+    let CameraProcesses { mut players, mut watchers } = cameras;
     if ending == Ending::Interrupted {
         // All are asked at once, as one that is asked to stop waits for no other.
         players.iter_mut().chain([&mut fusion, &mut recorder]).for_each(Component::ask_to_stop);

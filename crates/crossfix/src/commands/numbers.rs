@@ -3,9 +3,11 @@
 /// Latest time accepted, seconds since the Unix epoch: the end of this century. The earliest is 0,
 /// at which simulations begin. With half of it times after 2034 would be refused.
 const LAST_WALL_TIME: f64 = 4_102_444_800.0;
-/// Lowest and highest playing speed: a second takes a minute and a half, and a day as long. With
-/// half of the highest a day would take three minutes.
+/// Lowest playing speed but 0: a minute takes an hour and a half. Half of it would do as well; one
+/// of 1e-300 waits for ever.
 const LEAST_SPEED: f64 = 0.01;
+/// Highest playing speed: a day takes a minute and a half. With half of it one of three minutes
+/// would be the shortest.
 const MOST_SPEED: f64 = 1000.0;
 
 fn number(text: &str) -> Result<f64, String> {
@@ -32,18 +34,18 @@ pub fn speed(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A distance on a site, metres.
+/// A distance on a site, metres: at most 100 km, farther than any camera sees a drone.
 pub fn distance(text: &str) -> Result<f64, String> {
     within(text, 0.01, 100_000.0, " m")
 }
 
-/// A standard deviation of places, metres: at best a tenth of a millimetre.
-pub fn some_metres(text: &str) -> Result<f64, String> {
+/// A standard deviation of places, metres: not 0, as nobody knows a place exactly.
+pub fn sd_metres(text: &str) -> Result<f64, String> {
     within(text, 1e-4, 1000.0, " m")
 }
 
 /// A size or a standard deviation of places, metres; 0 is none.
-pub fn metres(text: &str) -> Result<f64, String> {
+pub fn metres_or_none(text: &str) -> Result<f64, String> {
     within(text, 0.0, 1000.0, " m")
 }
 
@@ -52,7 +54,7 @@ pub fn height_difference(text: &str) -> Result<f64, String> {
     within(text, -200.0, 200.0, " m")
 }
 
-/// A length or a standard deviation in an image, pixels.
+/// A length or a standard deviation in an image, pixels: not 0, as no label is exact.
 pub fn pixels(text: &str) -> Result<f64, String> {
     within(text, 0.01, 1000.0, " px")
 }
@@ -67,12 +69,13 @@ pub fn metres_per_second(text: &str) -> Result<f64, String> {
     within(text, 0.0, 10_000.0, " m/s")
 }
 
-/// How long a simulated scene lasts, seconds.
-pub fn scene_seconds(text: &str) -> Result<f64, String> {
+/// How long the demo's scene lasts, seconds: the first ones, until its tracks are sure, are left
+/// out of what it evaluates.
+pub fn demo_seconds(text: &str) -> Result<f64, String> {
     within(text, 5.0, 3600.0, " s")
 }
 
-/// How long states of a track wait for later bearings, seconds.
+/// How long states of a track wait for later bearings, seconds: as `tracking.smoothing_s` may.
 pub fn lag(text: &str) -> Result<f64, String> {
     within(text, 0.001, 2.0, " s")
 }
@@ -87,12 +90,47 @@ pub fn seconds(text: &str) -> Result<f64, String> {
     within(text, 0.0, 1e8, " s")
 }
 
-/// Size of a file, MB.
+/// Size of a file, MB: a smaller one would hold a few messages.
 pub fn megabytes(text: &str) -> Result<f64, String> {
     within(text, 0.1, 1e9, " MB")
 }
 
-/// Space on a disk, GB.
+/// What files may take together, GB: not 0, which would remove them all.
+pub fn quota(text: &str) -> Result<f64, String> {
+    within(text, 1e-9, 1e9, " GB")
+}
+
+/// How long a camera is watched, seconds: a moment to a day.
+pub fn seconds_of_a_day(text: &str) -> Result<f64, String> {
+    within(text, 0.1, 86_400.0, " s")
+}
+
+/// A time that a clock by hand may be off by, seconds.
+pub fn seconds_by_hand(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 600.0, " s")
+}
+
+/// A standard deviation of simulated bearings, pixels.
+pub fn noise_pixels(text: &str) -> Result<f64, String> {
+    within(text, 0.01, 100.0, " px")
+}
+
+/// How many there are of something in the mean.
+pub fn mean_count(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 10_000.0, "")
+}
+
+/// A probability.
+pub fn probability(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 1.0, "")
+}
+
+/// A rate of turn, radians per second.
+pub fn radians_per_second(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 100.0, " rad/s")
+}
+
+/// Space that is left free on a disk, GB.
 pub fn gigabytes(text: &str) -> Result<f64, String> {
     within(text, 0.0, 1e9, " GB")
 }
@@ -160,11 +198,13 @@ mod tests {
 
     #[test]
     fn what_is_out_of_range_is_refused_with_its_range() {
-        assert!(distance("0").is_err() && metres("0").is_ok() && metres("-1").is_err());
+        assert!(
+            distance("0").is_err() && metres_or_none("0").is_ok() && metres_or_none("-1").is_err()
+        );
         for bad in ["nan", "inf", "-1000", "1e300", "fast"] {
             let ranges =
-                [speed, distance, metres, height_difference, pixels, degrees, lag, minutes];
-            let more = [metres_per_second, seconds, megabytes, gigabytes, wall_time, rate];
+                [speed, distance, metres_or_none, height_difference, pixels, degrees, lag, minutes];
+            let more = [metres_per_second, seconds, megabytes, gigabytes, quota, wall_time, rate];
             assert!(ranges.iter().chain(&more).all(|range| range(bad).is_err()), "{bad}");
         }
         for bad in ["-1", "1e-300", "1001"] {

@@ -63,7 +63,8 @@ pub struct Args {
     #[arg(long, value_name = "SIZE", value_parser = size, conflicts_with = "config")]
     size: Option<[u32; 2]>,
     /// How long it is watched, s: cameras say what their clock shows every few seconds.
-    #[arg(long, default_value_t = 8.0, value_name = "SECONDS", value_parser = numbers::seconds_of_an_hour)]
+    #[arg(long, default_value_t = 8.0, value_name = "SECONDS", value_parser = numbers::seconds_of_a_day,
+          allow_negative_numbers = true)]
     seconds: f64,
     /// The file to write its last image to (JPEG).
     #[arg(long, value_name = "FILE")]

@@ -147,6 +147,11 @@ impl SourceConfig {
         }
     }
 
+    /// Whether this program decodes compressed video of it.
+    pub fn has_video(&self) -> bool {
+        matches!(self, Self::Stream(_) | Self::Video { .. })
+    }
+
     /// Whether it is a live camera.
     pub fn is_live(&self) -> bool {
         matches!(self, Self::Stream(_) | Self::Usb { .. } | Self::Gige { .. } | Self::Gstreamer(_))

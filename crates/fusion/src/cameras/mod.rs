@@ -37,7 +37,7 @@ use clutter::ClutterRate;
 use noise::BearingNoise;
 use pose_scale::PoseScale;
 use rooted::ReportedPlaces;
-use standing::Standing;
+use standing::StandingRecord;
 use watch::ErrorWatch;
 
 pub(crate) use calibration::KnownCamera;
@@ -46,7 +46,7 @@ pub(crate) use noise::{LASTING_S, RecentBearings, ThirdDifferences};
 pub(crate) use pointing::Pointed;
 pub(crate) use pose_scale::ScaleSample;
 pub(crate) use rooted::Rooted;
-pub use standing::CameraTrust;
+pub use standing::Standing;
 pub(crate) use standing::{Fitting, Fittings};
 pub use watch::PoseFinding;
 
@@ -97,11 +97,11 @@ pub(crate) struct CameraState {
     view: ReportedPlaces,
     told_clock: Option<ToldClock>,
     /// By the targets that three others see.
-    standing: Standing,
+    standing: StandingRecord,
     /// By the targets that two others see.
-    misfits: Standing,
+    misfits: StandingRecord,
     /// By the times of its frames.
-    punctuality: Standing,
+    punctuality: StandingRecord,
 }
 
 impl CameraState {
@@ -115,9 +115,9 @@ impl CameraState {
             clutter: ClutterRate::default(),
             view: ReportedPlaces::new(setup.rooted_s),
             told_clock: None,
-            standing: Standing::default(),
-            misfits: Standing::default(),
-            punctuality: Standing::default(),
+            standing: StandingRecord::default(),
+            misfits: StandingRecord::default(),
+            punctuality: StandingRecord::default(),
         }
     }
 
@@ -150,13 +150,13 @@ impl CameraState {
     }
 
     /// How far the camera is believed.
-    pub(crate) fn standing(&self) -> CameraTrust {
+    pub(crate) fn standing(&self) -> Standing {
         if self.is_excluded() {
-            CameraTrust::Excluded
+            Standing::Excluded
         } else if self.pose_scale.is_doubted() || self.noise_factor() > DOUBTED_NOISE {
-            CameraTrust::Doubted
+            Standing::Doubted
         } else {
-            CameraTrust::Good
+            Standing::Good
         }
     }
 
@@ -225,7 +225,7 @@ impl CameraState {
 
     /// Takes in whether a frame came in time (one that was refused says nothing else); returns the
     /// new standing if that has changed.
-    pub(crate) fn note_time(&mut self, time: Timestamp, in_time: bool) -> Option<CameraTrust> {
+    pub(crate) fn note_time(&mut self, time: Timestamp, in_time: bool) -> Option<Standing> {
         let fitting = if in_time { Fitting::Fits } else { Fitting::Refused };
         self.punctuality.learn(time, &[fitting]);
         self.punctuality.review()
@@ -246,7 +246,7 @@ impl CameraState {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Judgement {
     /// The camera's new standing, where it has changed.
-    pub(crate) standing: Option<CameraTrust>,
+    pub(crate) standing: Option<Standing>,
     /// The camera's bearings pass beside targets: its clock may be wrong.
     pub(crate) suspects_clock: bool,
 }
@@ -365,12 +365,12 @@ impl Cameras {
         camera.misfits.learn(time, &fittings.of_two);
         // By targets that only two others see nobody is accused, but the camera's clock may be
         // wrong.
-        let misfits = camera.misfits.review() == Some(CameraTrust::Excluded);
+        let misfits = camera.misfits.review() == Some(Standing::Excluded);
         // After `learn`, which renews the time of the last comparison: only an exposure that says
         // nothing lets a verdict lapse.
-        let lapsed = camera.standing.lapse(time).then_some(CameraTrust::Good);
+        let lapsed = camera.standing.lapse(time).then_some(Standing::Good);
         let standing = camera.standing.review().or(lapsed);
-        let excluded = standing == Some(CameraTrust::Excluded);
+        let excluded = standing == Some(Standing::Excluded);
         if excluded {
             let others = self.by_name.iter_mut().filter(|(other, _)| *other != name);
             others.for_each(|(_, other)| other.standing.acquit());

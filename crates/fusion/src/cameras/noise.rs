@@ -26,8 +26,8 @@ const MEMORY: f64 = 200.0;
 /// Standard error of the logarithm of the scale after one draw (simulated: neighbouring draws share
 /// three of their four bearings).
 const ERROR_OF_ONE: f64 = 1.9;
-/// A camera whose scale is this many standard errors above what it reports is no longer taken at
-/// its word. With half as many one in four is doubted by chance before its first two hundred draws
+/// A camera whose scale is this many standard errors above 1 has more noise than it reports. With
+/// half as many one in four is doubted by chance before its first two hundred draws
 /// are over.
 const DOUBT: f64 = 3.0;
 /// A camera's reported variance is divided into parts if its white noise is this many standard

@@ -29,7 +29,7 @@ const LONGEST_STEP_S: f64 = 1.0;
 
 /// How far a camera is believed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum CameraTrust {
+pub enum Standing {
     /// Its bearings are as good as it says.
     Good,
     /// Its bearings miss the targets by more than is declared of its pose: they count less.
@@ -88,12 +88,12 @@ impl StandingEvidence {
     }
 }
 
-/// Standing of a camera by one kind of evidence; `None` as long as there was nothing to compare it
+/// StandingRecord of a camera by one kind of evidence; `None` as long as there was nothing to compare it
 /// with.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Standing(Option<StandingEvidence>);
+pub(super) struct StandingRecord(Option<StandingEvidence>);
 
-impl Standing {
+impl StandingRecord {
     /// Takes in how an exposure fits, at a time by its camera's own clock. All targets of one
     /// exposure are one piece of evidence: they share its pose and time.
     pub(super) fn learn(&mut self, time: Timestamp, fittings: &[Fitting]) {
@@ -138,7 +138,7 @@ impl Standing {
     }
 
     /// Leaves the camera out or lets it back in; returns the new standing if that has changed.
-    pub(super) fn review(&mut self) -> Option<CameraTrust> {
+    pub(super) fn review(&mut self) -> Option<Standing> {
         let evidence =
             self.0.as_mut().filter(|evidence| evidence.compared_s >= LEAST_EVIDENCE_S)?;
         // Hysteresis: two limits, so that a camera between them does not come and go.
@@ -146,7 +146,7 @@ impl Standing {
         let excluded = evidence.wrong > limit;
         let changed = excluded != evidence.excluded;
         evidence.excluded = excluded;
-        let standing = if excluded { CameraTrust::Excluded } else { CameraTrust::Good };
+        let standing = if excluded { Standing::Excluded } else { Standing::Good };
         changed.then_some(standing)
     }
 }
@@ -156,8 +156,8 @@ mod tests {
     use super::*;
 
     /// The verdicts on a camera that gives the same evidence `rate` times per second.
-    fn verdicts(fittings: &[&[Fitting]], rate: f64) -> Vec<CameraTrust> {
-        let mut standing = Standing::default();
+    fn verdicts(fittings: &[&[Fitting]], rate: f64) -> Vec<Standing> {
+        let mut standing = StandingRecord::default();
         let mut verdicts = Vec::new();
         let mut time = Timestamp::EPOCH;
         for fitting in fittings {
@@ -177,7 +177,7 @@ mod tests {
             assert_eq!(verdicts(&[&[Fits], &[Fits]], rate), []);
             assert_eq!(
                 verdicts(&[&[Fits], &[Beside], &[Fits]], rate),
-                [CameraTrust::Excluded, CameraTrust::Good],
+                [Standing::Excluded, Standing::Good],
                 "{rate} Hz"
             );
         }
@@ -185,12 +185,12 @@ mod tests {
 
     #[test]
     fn a_verdict_lapses_where_nothing_is_left_to_compare_with() {
-        let mut standing = Standing::default();
+        let mut standing = StandingRecord::default();
         let at = |seconds: f64| Timestamp::EPOCH.plus_seconds(seconds);
         for k in 0..50 {
             standing.learn(at(0.1 * f64::from(k)), &[Fitting::Beside]);
         }
-        assert_eq!(standing.review(), Some(CameraTrust::Excluded));
+        assert_eq!(standing.review(), Some(Standing::Excluded));
         assert!(!standing.lapse(at(9.0)));
         assert!(standing.lapse(at(10.0)));
         assert!(!standing.is_excluded() && !standing.lapse(at(20.0)));
@@ -198,13 +198,13 @@ mod tests {
 
     #[test]
     fn what_was_held_against_others_beside_a_camera_that_is_left_out_is_void() {
-        let mut both = [Standing::default(); 2];
+        let mut both = [StandingRecord::default(); 2];
         for k in 0..50 {
             let time = Timestamp::EPOCH.plus_seconds(0.1 * f64::from(k));
             both.iter_mut().for_each(|standing| standing.learn(time, &[Fitting::Beside]));
         }
         let [mut one, mut other] = both;
-        assert_eq!(one.review(), Some(CameraTrust::Excluded));
+        assert_eq!(one.review(), Some(Standing::Excluded));
         one.acquit();
         other.acquit();
         assert_eq!(other.review(), None);
@@ -218,7 +218,7 @@ mod tests {
 
     #[test]
     fn a_camera_whose_frames_are_refused_is_left_out() {
-        assert_eq!(verdicts(&[&[Fitting::Refused]], 30.0), [CameraTrust::Excluded]);
+        assert_eq!(verdicts(&[&[Fitting::Refused]], 30.0), [Standing::Excluded]);
     }
 
     #[test]

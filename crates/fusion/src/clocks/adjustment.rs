@@ -11,8 +11,8 @@ use super::window::WindowBearing;
 /// the first descent, when all may be far off. With half of it one in ten of the target's own pulls
 /// too little.
 const HUBER: f64 = 9.0;
-/// Squared distance beyond which a bearing does not pull at all, in the later descents: it is a
-/// stranger, of another object (1 in 60 000 of the target's own lies beyond; with half of it 1 in
+/// Squared distance beyond which a bearing does not pull at all, in the later descents: it is
+/// of another object (1 in 60 000 of the target's own lies beyond; with half of it 1 in
 /// 245).
 const OUTLIER: f64 = 22.0;
 /// Median of a squared distance of two degrees of freedom.
@@ -145,7 +145,7 @@ impl<'a> Adjustment<'a> {
     /// weights.
     pub(super) fn solve(mut self, density: i32) -> Option<AdjustedCameras> {
         // Huber's loss still draws the far ones in, while all may be far off; the trimmed one, from
-        // then on, lets strangers go.
+        // then on, lets those of other objects go.
         let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
         self.rescale(&state, Loss::Huber);
         let (mut state, mut density, mut evidence) = self.best_density(state, density)?;

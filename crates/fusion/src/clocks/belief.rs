@@ -29,7 +29,7 @@ const MAX_OFFSET_S: f64 = 2.0;
 /// An uncertain camera pose: index of its error in the state, and its covariance as reported.
 #[derive(Clone, Copy, Debug)]
 struct UnsurePose {
-    place: usize,
+    index: usize,
     reported: Matrix6<f64>,
 }
 
@@ -38,11 +38,11 @@ struct UnsurePose {
 struct ClockEntry {
     /// Index of its offset from the reference; its drift is the next. `None` for the reference
     /// itself, the first camera heard.
-    place: Option<usize>,
+    index: Option<usize>,
     /// Its camera's pose, where that is uncertain.
     pose: Option<UnsurePose>,
-    /// Variance of its offset from true time before any bearing, s^2; 0 where the camera is taken
-    /// at its word.
+    /// Variance of its offset from true time before any bearing, s^2; 0 where the camera's
+    /// report is used as it is.
     prior: f64,
     /// The same for its drift, (s/s)^2.
     drift_prior: f64,
@@ -89,23 +89,23 @@ impl Belief {
     ) {
         let (prior, drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
         let reference = self.reference();
-        let others: Vec<usize> = self.clock_places().collect();
-        let place = reference.map(|_| self.grow(2));
-        if let (Some(reference), Some(place)) = (reference, place) {
+        let others: Vec<usize> = self.clock_indices().collect();
+        let index = reference.map(|_| self.grow(2));
+        if let (Some(reference), Some(index)) = (reference, index) {
             // The offset o_k - o_r from the reference r has the variance v_k + v_r, ...
             let own = [prior + OFFSET_FLOOR_S.powi(2), drift_prior + DRIFT_FLOOR.powi(2)];
             for (i, common) in [reference.prior, reference.drift_prior].into_iter().enumerate() {
                 // ... of which v_r, the reference's own, is in common with every other offset.
                 for &other in &others {
-                    self.covariance[(place + i, other + i)] = common;
-                    self.covariance[(other + i, place + i)] = common;
+                    self.covariance[(index + i, other + i)] = common;
+                    self.covariance[(other + i, index + i)] = common;
                 }
-                self.covariance[(place + i, place + i)] = common + own[i];
+                self.covariance[(index + i, index + i)] = common + own[i];
             }
         }
         self.cameras.insert(
             camera.clone(),
-            ClockEntry { place, pose: None, prior, drift_prior, walk, inflation: None },
+            ClockEntry { index, pose: None, prior, drift_prior, walk, inflation: None },
         );
         self.settle();
         self.calibrate(camera, pose);
@@ -118,13 +118,13 @@ impl Belief {
             return;
         };
         let pose = pose.map(|covariance| {
-            let first = before.map_or_else(|| self.grow(6), |before| before.place);
+            let first = before.map_or_else(|| self.grow(6), |before| before.index);
             self.mean.fixed_rows_mut::<6>(first).fill(0.0);
             self.covariance.fixed_rows_mut::<6>(first).fill(0.0);
             self.covariance.fixed_columns_mut::<6>(first).fill(0.0);
             let regular = covariance + Matrix6::identity() * POSE_FLOOR.powi(2);
             self.covariance.fixed_view_mut::<6, 6>(first, first).copy_from(&regular);
-            UnsurePose { place: first, reported: covariance }
+            UnsurePose { index: first, reported: covariance }
         });
         if let Some(known) = self.cameras.get_mut(camera) {
             known.pose = pose;
@@ -140,22 +140,22 @@ impl Belief {
     }
 
     /// State indices of all offsets.
-    fn clock_places(&self) -> impl Iterator<Item = usize> + '_ {
-        self.cameras.values().filter_map(|clock| clock.place)
+    fn clock_indices(&self) -> impl Iterator<Item = usize> + '_ {
+        self.cameras.values().filter_map(|clock| clock.index)
     }
 
     fn reference(&self) -> Option<ClockEntry> {
-        self.cameras.values().find(|clock| clock.place.is_none()).copied()
+        self.cameras.values().find(|clock| clock.index.is_none()).copied()
     }
 
     /// State index of a clock's offset; its drift is the next. `None` for the reference.
-    pub(super) fn place(&self, camera: &CameraName) -> Option<usize> {
-        self.cameras.get(camera)?.place
+    pub(super) fn index(&self, camera: &CameraName) -> Option<usize> {
+        self.cameras.get(camera)?.index
     }
 
     /// State index of a camera's pose, of six components; `None` where the pose is exact.
     pub(super) fn pose(&self, camera: &CameraName) -> Option<usize> {
-        Some(self.cameras.get(camera)?.pose?.place)
+        Some(self.cameras.get(camera)?.pose?.index)
     }
 
     /// The standard deviation that a camera has reported of its clock, s.
@@ -188,7 +188,7 @@ impl Belief {
         self.site[0] += self.site[1] * dt;
         // P <- F P F' + Q, where each offset grows by dt times its drift: of mean and covariance
         // only the rows and columns of offsets change.
-        let clocks: Vec<usize> = self.clock_places().collect();
+        let clocks: Vec<usize> = self.clock_indices().collect();
         for &k in &clocks {
             self.mean[k] += dt * self.mean[k + 1];
             let (mut offset, drift) = self.covariance.columns_range_pair_mut(k, k + 1);
@@ -205,15 +205,16 @@ impl Belief {
     }
 
     /// Adds the clocks' own random walks; that of the reference moves it relative to all others.
-    fn wander(&mut self, dt: f64, places: &[usize]) {
+    fn wander(&mut self, dt: f64, indices: &[usize]) {
         for clock in self.cameras.values_mut() {
             let walked = clock.walk * dt;
             clock.prior += walked;
-            match clock.place {
+            match clock.index {
                 _ if walked == 0.0 => {}
-                Some(place) => self.covariance[(place, place)] += walked,
+                Some(index) => self.covariance[(index, index)] += walked,
                 None => {
-                    for (&k, &l) in places.iter().flat_map(|k| places.iter().map(move |l| (k, l))) {
+                    for (&k, &l) in indices.iter().flat_map(|k| indices.iter().map(move |l| (k, l)))
+                    {
                         self.covariance[(k, l)] += walked;
                     }
                 }
@@ -269,11 +270,11 @@ impl Belief {
 
     /// Handles a report that a clock is worse than it was: standard deviations of offset (s) and
     /// drift (s/s). The mean stays, and may be off by that much.
-    pub(super) fn reopen(&mut self, camera: &CameraName, deviations: [f64; 2]) {
+    pub(super) fn worsen(&mut self, camera: &CameraName, deviations: [f64; 2]) {
         let stood = self.forget(camera, deviations);
-        let place = self.cameras.get(camera).and_then(|clock| clock.place);
-        for (place, [offset, drift]) in place.into_iter().zip(stood) {
-            (self.mean[place], self.mean[place + 1]) = (offset, drift);
+        let index = self.cameras.get(camera).and_then(|clock| clock.index);
+        for (index, [offset, drift]) in index.into_iter().zip(stood) {
+            (self.mean[index], self.mean[index + 1]) = (offset, drift);
         }
         self.settle();
     }
@@ -281,17 +282,17 @@ impl Belief {
     /// Handles a camera's change to another clock, of these standard deviations of offset (s) and
     /// drift (s/s).
     pub(super) fn replace(&mut self, camera: &CameraName, deviations: [f64; 2]) {
-        let is_reference = self.cameras.get(camera).is_some_and(|clock| clock.place.is_none());
+        let is_reference = self.cameras.get(camera).is_some_and(|clock| clock.index.is_none());
         let stood = self.reference_offset_and_drift();
         if is_reference {
             // The others were known relative to the clock before.
-            self.doubt(camera);
+            self.widen(camera);
         }
         self.forget(camera, deviations);
         if is_reference {
             // The new reference starts at true time; the old one's offset goes into all others.
             let now = self.reference_offset_and_drift();
-            let others: Vec<usize> = self.clock_places().collect();
+            let others: Vec<usize> = self.clock_indices().collect();
             for i in 0..2 {
                 self.site[i] -= now[i];
                 others.iter().for_each(|&k| self.mean[k + i] += stood[i]);
@@ -306,38 +307,38 @@ impl Belief {
         let site = self.reference_offset_and_drift();
         let clock = self.cameras.get_mut(camera)?;
         (clock.prior, clock.drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
-        let place = clock.place;
+        let index = clock.index;
         self.settle();
         // The new deviations change the clocks' shares: keep the common time where it was.
         for (i, stepped) in self.reference_offset_and_drift().into_iter().enumerate() {
             self.site[i] += site[i] - stepped;
         }
-        let stood = place.map(|place| [self.mean[place], self.mean[place + 1]]);
-        self.doubt(camera);
+        let stood = index.map(|index| [self.mean[index], self.mean[index + 1]]);
+        self.widen(camera);
         stood
     }
 
     /// Forgets all that was learnt of a clock that may have jumped: it is no better known than a
     /// clock that is not as good as reported.
-    pub(super) fn doubt_jumped(&mut self, camera: &CameraName) {
-        self.doubt_beside(camera, LIARS_SD_S.powi(2));
+    pub(super) fn widen_jumped(&mut self, camera: &CameraName) {
+        self.widen_by(camera, LIARS_SD_S.powi(2));
     }
 
     /// Forgets all that was learnt of a clock: only its reported deviations remain.
-    pub(super) fn doubt(&mut self, camera: &CameraName) {
-        self.doubt_beside(camera, 0.0);
+    pub(super) fn widen(&mut self, camera: &CameraName) {
+        self.widen_by(camera, 0.0);
     }
 
     /// Forgets all that was learnt of a clock, whose offset may have changed by as much as a
     /// variance says, s^2, beside what was reported.
-    fn doubt_beside(&mut self, camera: &CameraName, jumped: f64) {
+    fn widen_by(&mut self, camera: &CameraName, jumped: f64) {
         let (Some(clock), Some(reference)) = (self.cameras.get(camera).copied(), self.reference())
         else {
             return;
         };
-        let Some(place) = clock.place else {
+        let Some(index) = clock.index else {
             // All other offsets are relative to the reference: they share its deviation.
-            let others: Vec<usize> = self.clock_places().collect();
+            let others: Vec<usize> = self.clock_indices().collect();
             for (i, variance) in [clock.prior + jumped, clock.drift_prior].into_iter().enumerate() {
                 for (&k, &l) in others.iter().flat_map(|k| others.iter().map(move |l| (k, l))) {
                     self.covariance[(k + i, l + i)] += variance;
@@ -354,10 +355,10 @@ impl Belief {
         ];
         for (i, variance) in variances.into_iter().enumerate() {
             // At true time again, which lies at minus the reference's own offset from it.
-            self.mean[place + i] = -common[i];
-            self.covariance.row_mut(place + i).fill(0.0);
-            self.covariance.column_mut(place + i).fill(0.0);
-            self.covariance[(place + i, place + i)] = variance;
+            self.mean[index + i] = -common[i];
+            self.covariance.row_mut(index + i).fill(0.0);
+            self.covariance.column_mut(index + i).fill(0.0);
+            self.covariance[(index + i, index + i)] = variance;
         }
         self.settle();
     }
@@ -367,7 +368,7 @@ impl Belief {
         let mut anew = Self { epoch: self.epoch, ..Self::default() };
         let mut cameras: Vec<(&CameraName, &ClockEntry)> = self.cameras.iter().collect();
         // In the order in which they were heard: the reference first.
-        cameras.sort_by_key(|(_, clock)| clock.place.map_or(0, |place| place + 1));
+        cameras.sort_by_key(|(_, clock)| clock.index.map_or(0, |index| index + 1));
         for (camera, clock) in cameras {
             let pose = clock.pose.map(|pose| pose.reported);
             anew.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], clock.walk, pose);
@@ -393,9 +394,9 @@ impl Belief {
     /// A clock's offset (component 0) or drift (1) relative to the reference, the offset `ahead`
     /// seconds after the epoch.
     fn relative(&self, clock: &ClockEntry, component: usize, ahead: f64) -> f64 {
-        clock.place.map_or(0.0, |place| match component {
-            0 => self.mean[place] + ahead * self.mean[place + 1],
-            _ => self.mean[place + 1],
+        clock.index.map_or(0.0, |index| match component {
+            0 => self.mean[index] + ahead * self.mean[index + 1],
+            _ => self.mean[index + 1],
         })
     }
 
@@ -432,10 +433,10 @@ impl Belief {
         let mut row: BTreeMap<usize, f64> = BTreeMap::new();
         let others = self.shares().map(|(other, share)| (other, -share));
         for (one, weight) in std::iter::once((clock, 1.0)).chain(others) {
-            let Some(place) = one.place.filter(|_| weight != 0.0) else { continue };
-            *row.entry(place + component).or_default() += weight;
+            let Some(index) = one.index.filter(|_| weight != 0.0) else { continue };
+            *row.entry(index + component).or_default() += weight;
             if component == 0 {
-                *row.entry(place + 1).or_default() += weight * ahead;
+                *row.entry(index + 1).or_default() += weight * ahead;
             }
         }
         row
@@ -443,7 +444,7 @@ impl Belief {
 
     /// Whether all offsets are such as clocks may have: beyond [`MAX_OFFSET_S`] a fit went astray.
     pub(super) fn is_possible(&self) -> bool {
-        self.clock_places().all(|place| self.mean[place].abs() <= MAX_OFFSET_S)
+        self.clock_indices().all(|index| self.mean[index].abs() <= MAX_OFFSET_S)
     }
 
     /// Factor by which the bearings of a camera have repeated one another in the latest windows;

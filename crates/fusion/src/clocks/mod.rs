@@ -110,8 +110,7 @@ struct Round {
 }
 
 /// Time over which a clock's random walk is counted, s: a clock that wanders by the least deviation
-/// within it is not taken at its word. With half of it one may wander 1.4 times as far and is taken
-/// at its word.
+/// within it is estimated. With half of it one that wanders 1.4 times as far is not.
 const WALK_S: f64 = WINDOW_S;
 
 /// Estimates the clocks of all cameras.
@@ -201,7 +200,7 @@ impl ClockEstimator {
             if is_another {
                 self.belief.replace(camera, deviations);
             } else {
-                self.belief.reopen(camera, deviations);
+                self.belief.worsen(camera, deviations);
             }
             self.forget_provisional();
             self.suspect(camera);
@@ -217,7 +216,7 @@ impl ClockEstimator {
         known: &ClockEstimate,
         reported_sd_s: f64,
     ) -> f64 {
-        if self.is_at_its_word(camera) {
+        if self.uses_reported_sd(camera) {
             known.relative_sd_s.max(reported_sd_s)
         } else {
             known.relative_sd_s
@@ -225,7 +224,7 @@ impl ClockEstimator {
     }
 
     /// Whether a clock is not estimated because its camera reports that it is good.
-    fn is_at_its_word(&self, camera: &CameraName) -> bool {
+    fn uses_reported_sd(&self, camera: &CameraName) -> bool {
         !self.belief.is_uncertain(camera) && !self.config.trusted.contains(camera)
     }
 
@@ -252,9 +251,9 @@ impl ClockEstimator {
     /// The estimate of a camera's clock.
     pub(crate) fn estimate(&self, camera: &CameraName) -> Option<ClockEstimate> {
         let estimate = self.newest().estimate(camera, self.now)?;
-        let at_its_word = self.is_at_its_word(camera);
+        let uses_reported = self.uses_reported_sd(camera);
         let widens =
-            |reported: &&Reported| at_its_word || (reported.suspected && !reported.cleared);
+            |reported: &&Reported| uses_reported || (reported.suspected && !reported.cleared);
         let reported = self.reported.get(camera).filter(widens);
         let widened = |sd: f64| reported.map_or(sd, |reported| reported.sd_s.max(sd));
         let (sd_s, relative_sd_s) = (widened(estimate.sd_s), widened(estimate.relative_sd_s));
@@ -324,7 +323,11 @@ impl ClockEstimator {
             return;
         };
         let is_new = !self.windows[index].cameras.contains(camera);
-        let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
+        let role = if is_new && self.is_to_be_estimated(camera, index) {
+            Role::Estimated
+        } else {
+            Role::Anchor
+        };
         let window = &mut self.windows[index];
         let CameraUncertainty { declared_lasting, factor, .. } = exposure.uncertainty;
         let line = StampedLine { time, line: *line, lasting: declared_lasting, white: factor };
@@ -341,7 +344,7 @@ impl ClockEstimator {
 
     /// Whether a window should learn a camera's clock: it is among the worst known, and the camera
     /// is in no other window.
-    fn is_wanted(&self, camera: &CameraName, index: usize) -> bool {
+    fn is_to_be_estimated(&self, camera: &CameraName, index: usize) -> bool {
         let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
         let sd = self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
         // The worst half first: a window holds few cameras.
@@ -437,7 +440,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_clock_at_its_word_is_as_good_as_each_frame_says_and_a_trusted_one_is_right() {
+    fn a_clock_that_is_not_estimated_is_as_good_as_each_frame_says_and_a_trusted_one_is_right() {
         let [word, trusted, unsure] =
             ["a", "t", "u"].map(|name| name.parse::<CameraName>().unwrap());
         let config = Clocks { trusted: vec![trusted.clone()], ..Clocks::default() };

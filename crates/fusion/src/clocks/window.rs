@@ -9,25 +9,25 @@ use crate::track::TrackId;
 use crate::uncertainty::CorrelatedNoise;
 
 /// Bounds on a window, as the time that an adjustment takes grows with it.
-struct Most {
+struct WindowBounds {
     /// Bearings. When it is full, every other one of each camera is dropped, and from then on every
     /// other new one too. With half of it six cameras of 30 Hz are thinned to 15 Hz, and their
     /// clocks are known 1.4 times less well.
     bearings: usize,
     /// Cameras, with eight unknowns each. The others have their turn with another window. With half
-    /// of it the links alone may fill a window.
+    /// of it the anchors alone may fill a window.
     cameras: usize,
-    /// Links ([`Role::Link`]) among them in the first [`ADMISSION_S`]. With twice as much they may
-    /// take all places before a wanted camera is heard.
-    links: usize,
+    /// Anchors ([`Role::Anchor`]) among them in the first [`ADMISSION_S`]. With twice as much they may
+    /// take all places before a camera to be estimated is heard.
+    anchors: usize,
     /// Time of a bearing from the window's beginning, s. With half of it the same: a window is
     /// closed after eight seconds, and no clock is off by more than two.
     span_s: f64,
 }
 
-const MOST: Most = Most { bearings: 1500, cameras: 8, links: 4, span_s: 30.0 };
-/// After this all wanted cameras that see the target have been heard, s. With half of it a link may
-/// take the place of a wanted camera of two frames a second.
+const BOUNDS: WindowBounds = WindowBounds { bearings: 1500, cameras: 8, anchors: 4, span_s: 30.0 };
+/// After this all cameras to be estimated that see the target have been heard, s. With half of it
+/// an anchor may take the place of one of two frames a second.
 const ADMISSION_S: f64 = 0.5;
 /// Least bearings of a camera: with fewer, what it says of its clock cannot be checked. With half
 /// of it two bearings, four numbers, are fitted by the eight unknowns of clock and pose.
@@ -64,9 +64,9 @@ pub(super) struct StampedLine {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Role {
     /// Its clock is to be learnt.
-    Wanted,
+    Estimated,
     /// Its clock is known, or another window's task: the others are learnt relative to it.
-    Link,
+    Anchor,
 }
 
 /// The bearings of a track.
@@ -78,8 +78,8 @@ pub(super) struct TrackWindow {
     pub(super) sights: Vec<WindowBearing>,
     /// One in this many bearings of each camera is taken.
     thinned: usize,
-    /// Number of its cameras that are links.
-    links: usize,
+    /// Number of its cameras that are anchors.
+    anchors: usize,
     /// Number of bearings that each camera has offered.
     offered: Vec<usize>,
     /// White part of each camera's noise, as a factor on the reported variance, by its newest
@@ -95,7 +95,7 @@ impl TrackWindow {
             cameras: Vec::new(),
             sights: Vec::new(),
             thinned: 1,
-            links: 0,
+            anchors: 0,
             offered: Vec::new(),
             white: Vec::new(),
         }
@@ -110,18 +110,18 @@ impl TrackWindow {
         place: Vector3<f64>,
     ) {
         let time_s = time.seconds_since(self.start);
-        if time_s.abs() > MOST.span_s {
+        if time_s.abs() > BOUNDS.span_s {
             return;
         }
         let known = self.cameras.iter().position(|known| known == camera);
-        let no_link = self.links >= MOST.links && time_s < ADMISSION_S;
+        let no_anchor = self.anchors >= BOUNDS.anchors && time_s < ADMISSION_S;
         if known.is_none()
-            && (self.cameras.len() >= MOST.cameras || (role == Role::Link && no_link))
+            && (self.cameras.len() >= BOUNDS.cameras || (role == Role::Anchor && no_anchor))
         {
             return;
         }
         let index = known.unwrap_or_else(|| {
-            self.links += usize::from(role == Role::Link);
+            self.anchors += usize::from(role == Role::Anchor);
             self.cameras.push(camera.clone());
             self.offered.push(0);
             self.white.push(white);
@@ -138,7 +138,7 @@ impl TrackWindow {
             let allowance = line.covariance.trace() / alone;
             self.sights.push(WindowBearing { time_s, camera: index, line, allowance, place });
         }
-        if self.sights.len() >= MOST.bearings {
+        if self.sights.len() >= BOUNDS.bearings {
             self.thin();
         }
     }
@@ -258,13 +258,13 @@ mod tests {
             let time = Timestamp::from_seconds(f64::from(k) * 1e-3);
             window.add(
                 &camera,
-                Role::Wanted,
+                Role::Estimated,
                 StampedLine { time, line, lasting: CorrelatedNoise::NONE, white: 1.0 },
                 Vector3::zeros(),
             );
         }
         assert!(
-            (MOST.bearings / 2..=MOST.bearings).contains(&window.sights.len()),
+            (BOUNDS.bearings / 2..=BOUNDS.bearings).contains(&window.sights.len()),
             "{}",
             window.sights.len()
         );
@@ -275,13 +275,13 @@ mod tests {
     }
 
     #[test]
-    fn clocks_that_are_to_be_learnt_go_before_links() {
+    fn clocks_that_are_to_be_learnt_go_before_anchors() {
         let mut window = TrackWindow::new(TrackId(1), Timestamp::EPOCH);
         let line = line_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0), 0.0).line;
         // Sixteen cameras, of which the last two are to be learnt, three times in half a second.
         for k in 0..60_u32 {
             let camera = format!("{:02}", k % 16).parse().unwrap();
-            let role = if k % 16 < 14 { Role::Link } else { Role::Wanted };
+            let role = if k % 16 < 14 { Role::Anchor } else { Role::Estimated };
             window.add(
                 &camera,
                 role,
@@ -296,6 +296,6 @@ mod tests {
         }
         let names: Vec<&str> = window.cameras.iter().map(CameraName::as_str).collect();
         assert_eq!(names[..6], ["00", "01", "02", "03", "14", "15"]);
-        assert_eq!(names.len(), MOST.cameras, "then the others");
+        assert_eq!(names.len(), BOUNDS.cameras, "then the others");
     }
 }

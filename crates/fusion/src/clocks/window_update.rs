@@ -79,7 +79,7 @@ pub(super) fn window_update(belief: &Belief, window: &TrackWindow) -> WindowUpda
     let mut belief = belief.clone();
     let now = window.start.plus_seconds(last);
     belief.advance(now);
-    let clocks = window.cameras.iter().filter(|camera| belief.place(camera).is_some()).count();
+    let clocks = window.cameras.iter().filter(|camera| belief.index(camera).is_some()).count();
     if clocks == 0 || window.cameras.len() < 2 {
         return WindowUpdate::Uninformative;
     }
@@ -227,7 +227,7 @@ impl JumpTest<'_> {
         plain: Option<&AdjustedCameras>,
     ) -> Option<Jump> {
         let mut belief = self.belief.clone();
-        belief.doubt_jumped(camera);
+        belief.widen_jumped(camera);
         let mut shown: Vec<&AdjustedCameras> = plain.into_iter().collect();
         let first = self.fit_once(&belief, window, &shown).filter(fits)?;
         // What counts as lasting only makes a jump less sure: one that does not show yet never will.
@@ -286,8 +286,8 @@ impl JumpTest<'_> {
 /// State components of a window's cameras: for each those of its clock, then those of its pose.
 fn components(belief: &Belief, window: &TrackWindow) -> Vec<usize> {
     let of_camera = |camera: &CameraName| {
-        let clock = belief.place(camera).map(|place| place..place + 2);
-        let pose = belief.pose(camera).map(|place| place..place + 6);
+        let clock = belief.index(camera).map(|index| index..index + 2);
+        let pose = belief.pose(camera).map(|index| index..index + 6);
         clock.into_iter().chain(pose).flatten()
     };
     window.cameras.iter().flat_map(of_camera).collect()
@@ -323,7 +323,7 @@ fn adjust(
         first
     };
     let unknowns = |camera: &CameraName| Unknowns {
-        clock: room(belief.place(camera), 2),
+        clock: room(belief.index(camera), 2),
         pose: room(belief.pose(camera), 6),
     };
     let cameras: Vec<Unknowns> = window.cameras.iter().map(unknowns).collect();

@@ -6,7 +6,7 @@ use crossfix_message::{CameraName, Timestamp};
 use crate::Exposure;
 
 /// Bounds on what waits in one queue. There are two queues, so about 30 MB in all.
-struct Most {
+struct QueueBounds {
     /// Exposures: 64 cameras of 60 Hz send 1920 within the default lateness, three of 30 Hz 5400
     /// within the longest. With half of it the latter are released before their lateness is over.
     exposures: usize,
@@ -15,7 +15,7 @@ struct Most {
     sightings: usize,
 }
 
-const MOST: Most = Most { exposures: 6_000, sightings: 100_000 };
+const BOUNDS: QueueBounds = QueueBounds { exposures: 6_000, sightings: 100_000 };
 
 /// Key by which exposures are ordered: two of a camera may be corrected to the same time, and the
 /// reported times tell them apart.
@@ -76,7 +76,7 @@ impl<Note> ReorderQueue<Note> {
     /// or if more wait than is allowed.
     pub(crate) fn pop_settled(&mut self, settled: Option<Timestamp>) -> Option<(Exposure, Note)> {
         let (first, _) = self.waiting.first_key_value()?;
-        let is_crowded = self.waiting.len() > MOST.exposures || self.sightings > MOST.sightings;
+        let is_crowded = self.waiting.len() > BOUNDS.exposures || self.sightings > BOUNDS.sightings;
         (is_crowded || settled.is_some_and(|settled| first.time <= settled)).then(|| self.pop())?
     }
 

@@ -62,7 +62,7 @@ impl Stream {
     }
 
     /// Notes the time of a frame; `late_s` is by how much the frame came too late, if it did.
-    pub(super) fn hear(&mut self, time: Timestamp, late_s: Option<f64>, lateness_s: f64) {
+    pub(super) fn observe(&mut self, time: Timestamp, late_s: Option<f64>, lateness_s: f64) {
         let behind_s = self.newest.seconds_since(time);
         let known_s = self.disorder_s(lateness_s);
         let far_behind = if behind_s > lateness_s { self.far_behind + 1 } else { 0 };

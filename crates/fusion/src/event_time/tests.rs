@@ -19,7 +19,7 @@ fn drain(buffer: &mut EventBuffer) -> Vec<f64> {
     let mut times = Vec::new();
     while let Some(next) = buffer.release() {
         let Ok(exposure) = next else { continue };
-        buffer.pass(exposure.time);
+        buffer.mark_processed(exposure.time);
         times.push(exposure.time.seconds());
     }
     times
@@ -55,11 +55,11 @@ fn what_is_overtaken_is_taken_until_something_later_is_worked_on() {
     }
     // Two come out, and the second waits for the clocks.
     buffer.release().unwrap().unwrap();
-    buffer.pass(Timestamp::from_seconds(1.0));
+    buffer.mark_processed(Timestamp::from_seconds(1.0));
     assert_eq!(buffer.release().unwrap().unwrap().time, Timestamp::from_seconds(1.2));
     assert_eq!(buffer.insert(exposure("a", 1.1)), Ok(ExposureArrival::OutOfOrder));
     assert_eq!(buffer.release().unwrap().unwrap().time, Timestamp::from_seconds(1.1));
-    buffer.pass(Timestamp::from_seconds(1.2));
+    buffer.mark_processed(Timestamp::from_seconds(1.2));
     let late = buffer.insert(exposure("a", 1.15)).unwrap_err();
     assert!(
         matches!(late, RejectionReason::Late { by_s } if (by_s - 0.05).abs() < 1e-9),
@@ -212,7 +212,7 @@ fn run(
             refused += usize::from(buffer.insert(exposure(&name, time_s)).is_err());
             while let Some(next) = buffer.release() {
                 match next {
-                    Ok(exposure) => buffer.pass(exposure.time),
+                    Ok(exposure) => buffer.mark_processed(exposure.time),
                     Err(_) => refused += 1,
                 }
             }

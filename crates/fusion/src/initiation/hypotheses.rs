@@ -21,7 +21,7 @@ use crate::visibility::log_missed;
 use crate::{Exposure, FusionConfig, Tracking};
 
 /// Bounds on time and memory, however much clutter there is; the best are kept.
-struct Most {
+struct HypothesisBounds {
     /// Bearings of one exposure with which one hypothesis is continued. With one alone, a bearing
     /// of something else that fits better takes the target's place.
     branches: usize,
@@ -35,7 +35,8 @@ struct Most {
     hypotheses: usize,
 }
 
-const MOST: Most = Most { branches: 3, of_tree: 100, alike: 20, hypotheses: 6_000 };
+const BOUNDS: HypothesisBounds =
+    HypothesisBounds { branches: 3, of_tree: 100, alike: 20, hypotheses: 6_000 };
 
 /// A hypothesis less likely than its tree's best by this log-likelihood is given up. With half of
 /// it a wrong branch that is ahead by eight can no longer be overtaken.
@@ -275,7 +276,7 @@ impl Hypotheses {
         // The likeliest continuation, with a bearing or without.
         let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
         near.retain(|(ratio, _)| *ratio > miss && *ratio > best - RIVAL_MARGIN);
-        near.truncate(MOST.branches);
+        near.truncate(BOUNDS.branches);
         let before = next.len();
         next.extend(near.into_iter().filter_map(|(ratio, index)| {
             self.continued_with(index, ratio, hypothesis.clone(), context, prediction.as_ref())
@@ -326,11 +327,11 @@ impl Hypotheses {
             let (best, count) = trees.entry(h.tree).or_insert((h.track.score, 0));
             *count += 1;
             // Sorted by score: the first of a tree is its best.
-            *count <= MOST.of_tree
+            *count <= BOUNDS.of_tree
                 && h.track.score > *best - TREE_MARGIN
                 && h.track.score > LEAST_SCORE
         });
-        self.hypotheses.truncate(MOST.hypotheses);
+        self.hypotheses.truncate(BOUNDS.hypotheses);
     }
 
     fn sort(&mut self) {
@@ -411,10 +412,10 @@ impl Hypotheses {
             newest.is_empty() || {
                 let count = seen.entry(newest).or_default();
                 *count += 1;
-                *count <= MOST.alike
+                *count <= BOUNDS.alike
             }
         });
-        self.hypotheses.truncate(MOST.hypotheses);
+        self.hypotheses.truncate(BOUNDS.hypotheses);
     }
 
     /// Confirms hypotheses: those of the best set without common lines that are likely enough and
@@ -451,7 +452,7 @@ impl Hypotheses {
                     let alike = |k: usize| {
                         same_target(&state, &self.hypotheses[k].track.predicted(now, motion))
                     };
-                    selection.loss_without(i, alike) >= RIVAL_MARGIN
+                    selection.margin_of(i, alike) >= RIVAL_MARGIN
                 }
             })
             .collect();

@@ -5,7 +5,7 @@ use crate::spatial::{TYPICAL_SPEED, TimedLine};
 
 /// Lines of one target pass each other within this many standard deviations of noise and motion.
 /// With half of it some true pairs are left out, and their targets are found a period later; with
-/// twice as much, twice as many pairs of strangers are tried.
+/// twice as much, twice as many pairs of lines of two targets are tried.
 const SIGMAS: f64 = 3.0;
 
 /// How two lines pass each other.

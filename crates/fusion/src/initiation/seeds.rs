@@ -15,7 +15,7 @@ use crate::spatial::{LineId, MapSolution, TYPICAL_SPEED, TimedLine, chi_square, 
 use crate::{Exposure, FusionConfig, Initiation};
 
 /// Bounds on time and memory in one period, however much clutter there is.
-struct Most {
+struct SeedBounds {
     /// Lines of one camera that are tried as an addition to a pair, the best first. With half of it
     /// a camera whose line of the target is the third best is left out of its seed.
     branches: usize,
@@ -30,7 +30,8 @@ struct Most {
     kept: usize,
 }
 
-const MOST: Most = Most { branches: 5, close_pairs: 20_000, found: 20_000, kept: 2_000 };
+const BOUNDS: SeedBounds =
+    SeedBounds { branches: 5, close_pairs: 20_000, found: 20_000, kept: 2_000 };
 
 /// Lines that are part of a set of at least this many cameras need not be tried in other sets. With
 /// half of it two lines that cross by chance keep the true set from being tried.
@@ -118,7 +119,7 @@ impl SeedFinder {
         for (a, b) in self.pairs_of_cameras(&growing) {
             for i in 0..lines[a].len() {
                 for j in 0..lines[b].len() {
-                    let enough = close > MOST.close_pairs || seeds.len() > MOST.found;
+                    let enough = close > BOUNDS.close_pairs || seeds.len() > BOUNDS.found;
                     // A line on which four cameras agree needs no other set.
                     if settled[a][i] || settled[b][j] || enough {
                         continue;
@@ -165,7 +166,7 @@ impl SeedFinder {
         let agreed: BTreeSet<&LineId> =
             order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
         order.retain(|&i| names[i].len() > 2 || !names[i].iter().all(|id| agreed.contains(id)));
-        order.truncate(MOST.kept);
+        order.truncate(BOUNDS.kept);
         let mut seeds: Vec<Option<Seed>> = seeds.into_iter().map(Some).collect();
         order.into_iter().filter_map(|i| seeds[i].take()).collect()
     }
@@ -214,7 +215,7 @@ impl SeedFinder {
             let mut next = Vec::new();
             for (places, solution) in open {
                 let near = self.near(growing, &places, &solution, c);
-                let most = if branched { 1 } else { MOST.branches };
+                let most = if branched { 1 } else { BOUNDS.branches };
                 for line in near.iter().take(most) {
                     let mut longer = places.clone();
                     longer.push((c, *line));

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::spatial::LineId;
 
 /// Most comparisons of leaves in one period, about a tenth of a second's worth; half of them are
-/// reserved for [`Selection::loss_without`], the question how sure each choice is. What they do not
+/// reserved for [`Selection::margin_of`], the question how sure each choice is. What they do not
 /// suffice for is not confirmed in that period: with half of it that happens in less clutter.
 const MAX_COMPARISONS: usize = 20_000_000;
 /// Most passes of the local search; each increases the total, and few are ever needed. With half of
@@ -83,7 +83,7 @@ impl Selection {
 
     /// How much the total score falls if a chosen leaf is wrong, together with all other leaves of
     /// its lines for which `alike` holds. 0 if the budget of comparisons is used up.
-    pub(super) fn loss_without(&self, chosen: usize, alike: impl Fn(usize) -> bool) -> f64 {
+    pub(super) fn margin_of(&self, chosen: usize, alike: impl Fn(usize) -> bool) -> f64 {
         let others: Vec<usize> = self.neighbours(chosen).filter(|&i| !alike(i)).collect();
         let mut without = self.chosen.clone();
         without.remove(&chosen);
@@ -210,15 +210,15 @@ mod tests {
         assert_eq!(selection.chosen().collect::<Vec<_>>(), [1, 2]);
         // The ghost clashes with the second target's leaf too, so nothing makes up for the first
         // one.
-        assert!((selection.loss_without(1, |_| false) - 10.0).abs() < 1e-9);
+        assert!((selection.margin_of(1, |_| false) - 10.0).abs() < 1e-9);
     }
 
     #[test]
     fn a_rival_takes_the_certainty_and_a_twin_does_not() {
         let selection = select(&[(12.0, &[0, 1]), (11.0, &[1, 2]), (-1.0, &[5])], 0);
         assert_eq!(selection.chosen().collect::<Vec<_>>(), [0]);
-        assert!((selection.loss_without(0, |_| false) - 1.0).abs() < 1e-9);
-        assert!((selection.loss_without(0, |i| i == 1) - 12.0).abs() < 1e-9);
+        assert!((selection.margin_of(0, |_| false) - 1.0).abs() < 1e-9);
+        assert!((selection.margin_of(0, |i| i == 1) - 12.0).abs() < 1e-9);
     }
 
     #[test]

@@ -66,7 +66,7 @@ pub(super) struct Ties {
     /// Time of its last bearing of the track, ...
     seen: Option<Timestamp>,
     /// ... and the interval to the one before, s.
-    period_s: f64,
+    period_s: Option<f64>,
     pub(super) recent: RecentBearings,
     pub(super) drawn: Option<Drawn>,
     /// The same for what it has seen beside the target, when it has not seen the target itself.
@@ -163,7 +163,7 @@ impl Ties {
             lasting_s: CorrelatedNoise::NONE.time_s,
             visibility: Visibility::new(time),
             seen: None,
-            period_s: 0.0,
+            period_s: None,
             recent: RecentBearings::default(),
             drawn: None,
             beside: None,
@@ -202,7 +202,7 @@ impl Ties {
 
     /// Notes a bearing of the track by the camera.
     pub(super) fn see(&mut self, time: Timestamp) {
-        self.period_s = self.seen.map_or(0.0, |seen| time.seconds_since(seen).abs());
+        self.period_s = self.seen.map(|seen| time.seconds_since(seen).abs());
         self.seen = Some(time);
     }
 
@@ -210,17 +210,23 @@ impl Ties {
     /// `holding_s` seconds, or longer for a slow camera. One that sees the target every two seconds
     /// has not lost it after one and a half.
     pub(super) fn has_seen_lately(&self, now: Timestamp, holding_s: f64) -> bool {
-        let period_s = self.period_s.min(LONGEST_PERIOD * holding_s);
+        let period_s = self.period_s.unwrap_or(0.0).min(LONGEST_PERIOD * holding_s);
         self.seen.is_some_and(|seen| {
             now.seconds_since(seen) <= holding_s.max(HOLDING_PERIODS * period_s)
         })
     }
 
     /// Whether the camera sees the target now: it has missed it for no longer than a detector's
-    /// ordinary misses last, or than its bearings are apart.
+    /// ordinary misses last, or than its bearings are apart. After one bearing nobody knows how far
+    /// they are apart: it sees the target for as long as it supports the track.
     pub(super) fn sees(&self, now: Timestamp, holding_s: f64) -> bool {
-        let period_s = self.period_s.min(LONGEST_PERIOD * holding_s);
-        let missed_s = (MISSED * holding_s).max(HOLDING_PERIODS * period_s);
+        let missed_s = match self.period_s {
+            None => holding_s,
+            Some(period_s) => {
+                let period_s = period_s.min(LONGEST_PERIOD * holding_s);
+                (MISSED * holding_s).max(HOLDING_PERIODS * period_s)
+            }
+        };
         self.seen.is_some_and(|seen| now.seconds_since(seen) <= missed_s)
     }
 

@@ -124,7 +124,7 @@ impl Tracker {
     ) -> Vec<Pairing> {
         // Least log-density of a bearing that is to update a track which this camera has lost sight
         // of.
-        let stranger = exposure.clutter_per_sr.ln() + FOUND_AGAIN_MARGIN;
+        let least_log_density = exposure.clutter_per_sr.ln() + FOUND_AGAIN_MARGIN;
         let origin = known.camera.pose().position();
         let mut candidates = Vec::new();
         for (row, track) in
@@ -149,7 +149,9 @@ impl Tracker {
             let open = exposure.sightings.iter().enumerate().filter(|(i, _)| owners[*i].is_none());
             for (column, sighting) in open {
                 let fit = prediction.fit(&sighting.line, self.gate);
-                if let Some(fit) = fit.filter(|fit| !lost_sight || fit.log_density > stranger) {
+                if let Some(fit) =
+                    fit.filter(|fit| !lost_sight || fit.log_density > least_log_density)
+                {
                     let gain = fit.log_ratio(visible * detection, exposure.clutter_per_sr)
                         - log_missed(visible, detection);
                     candidates.push(Pairing { row, column, gain });

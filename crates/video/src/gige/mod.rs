@@ -57,7 +57,7 @@ const IMPOSSIBLE: u32 = 20;
 /// if so.
 const PTP: [&str; 2] = ["PtpStatus", "GevIEEE1588Status"];
 const FOLLOWS: &str = "Slave";
-/// StreamLatency from the exposure to the arrival where nothing better is known: an image is read out and
+/// Latency from the exposure to the arrival where nothing better is known: an image is read out and
 /// sent within a frame's interval.
 const LATENCY: StreamLatency = StreamLatency { mean_s: 0.04, sd_s: 0.04 };
 /// Registers that every camera has, some in name only: ticks per second, the command that latches

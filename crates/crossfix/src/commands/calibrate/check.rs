@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{bail, ensure};
-use crossfix_fusion::{CameraTrust, Output};
+use crossfix_fusion::{Output, Standing};
 use crossfix_message::{CameraCalibration, CameraName, Channel, Timestamp};
 use crossfix_recording::Entry;
 use serde::Serialize;
@@ -109,8 +109,8 @@ impl CameraRecord {
         self.span = Some((first, time));
     }
 
-    fn note(&mut self, standing: CameraTrust, now: Timestamp) {
-        if standing == CameraTrust::Excluded {
+    fn note(&mut self, standing: Standing, now: Timestamp) {
+        if standing == Standing::Excluded {
             self.left_out_since.get_or_insert(now);
         } else if let Some(since) = self.left_out_since.take() {
             self.left_out_s += now.seconds_since(since);

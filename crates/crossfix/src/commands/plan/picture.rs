@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use crossfix_evaluation::bound::{CandidatePlace, PlannedCamera};
-use crossfix_view::{DrawnLandmark, VolumeCell, VolumePicture};
+use crossfix_view::{DrawnPlace, VolumeCell, VolumePicture};
 use nalgebra::Point3;
 
 use super::report::{self, PlanReport};
@@ -21,10 +21,10 @@ fn legend(report: &PlanReport) -> String {
     )
 }
 
-fn landmark(report: &PlanReport, candidate: &CandidatePlace) -> DrawnLandmark {
+fn landmark(report: &PlanReport, candidate: &CandidatePlace) -> DrawnPlace {
     let rank = report.best.iter().position(|best| best == candidate);
     let sd = candidate.score.median_sd_m;
-    DrawnLandmark {
+    DrawnPlace {
         place: Point3::from(candidate.position_m),
         sd_m: sd,
         label: rank.map(|rank| format!("choice {}: {sd:.3} m", rank + 1)),

@@ -10,7 +10,7 @@ use crossfix_recording::{RecordingError, RecordingWriter, Source};
 use time::OffsetDateTime;
 
 use crate::commands::numbers;
-use crate::output;
+use crate::output::{self, Misuse};
 use crate::repeats::Repeats;
 
 /// Writer of a recording to a file.
@@ -32,19 +32,20 @@ const LAST_SHARE: f64 = 0.1;
 pub struct Limits {
     /// Begin a new file whenever one is so large, MB. Files are named by when they begin:
     /// today-20261125T221700Z.mcap.
-    #[arg(long, value_name = "MB", value_parser = numbers::megabytes)]
+    #[arg(long, value_name = "MB", value_parser = numbers::megabytes, allow_negative_numbers = true)]
     rotate_mb: Option<f64>,
     /// Begin a new file after so many minutes.
-    #[arg(long, value_name = "MINUTES", value_parser = numbers::minutes)]
+    #[arg(long, value_name = "MINUTES", value_parser = numbers::minutes, allow_negative_numbers = true)]
     rotate_min: Option<f64>,
     /// Remove the oldest of the files that are named so, also those of earlier runs, when together
     /// they take more, GB.
-    #[arg(long, value_name = "GB", value_parser = numbers::gigabytes)]
+    #[arg(long, value_name = "GB", value_parser = numbers::quota, allow_negative_numbers = true)]
     quota_gb: Option<f64>,
     /// What is left free on the disk, GB. With less of it the oldest of these files goes; where there
     /// is none, pictures are not recorded, and with a tenth of it, nothing but bearings,
     /// calibrations and tracks.
-    #[arg(long, value_name = "GB", default_value_t = 0.5, value_parser = numbers::gigabytes)]
+    #[arg(long, value_name = "GB", default_value_t = 0.5, value_parser = numbers::gigabytes,
+          allow_negative_numbers = true)]
     leave_free_gb: f64,
 }
 
@@ -119,13 +120,14 @@ impl RecordFiles {
     /// # Errors
     /// If the options contradict each other.
     pub fn new(asked: &Path, overwrite: bool, limits: Limits) -> anyhow::Result<Self> {
+        let misuse = |words: &str| Misuse(words.to_owned());
         ensure!(
             limits.rotates() || limits.quota_gb.is_none(),
-            "--quota-gb removes files by their age: give --rotate-min or --rotate-mb, too"
+            misuse("--quota-gb removes files by their age: give --rotate-min or --rotate-mb, too")
         );
         ensure!(
             !(limits.rotates() && overwrite),
-            "--overwrite replaces one file: with --rotate-min or --rotate-mb each has a name of its own"
+            misuse("--overwrite replaces one file: rotated ones have names of their own")
         );
         let mut files = Self {
             asked: asked.to_owned(),

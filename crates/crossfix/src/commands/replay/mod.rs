@@ -1,11 +1,11 @@
 mod offline;
 mod online;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
-use crossfix_message::{Channel, Key, Timestamp};
+use crossfix_message::{CameraName, Channel, Key, Timestamp, glance};
 use crossfix_recording::{Entry, RecordingReader};
 
 use crate::commands::numbers;
@@ -67,11 +67,35 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let recalibration = args.calibration.as_deref().map(Recalibration::load).transpose()?;
-    let range = Range::of(args, recalibration.as_ref())?;
+    let mut contents = Contents::default();
+    let range = Range::of(args, recalibration.as_ref(), &mut contents)?;
     match (&args.output, &args.network) {
         (Some(output), _) => offline::fuse(args, output, range, recalibration),
-        (None, Some(network)) => online::publish(args, network, range),
+        (None, Some(network)) => online::publish(args, network, range, &contents),
         (None, None) => anyhow::bail!("give --fuse with an output, or --network"),
+    }
+}
+
+/// What a recording holds that is to be published.
+#[derive(Debug, Default)]
+struct Contents {
+    /// The cameras that it has bearings of.
+    cameras: BTreeSet<CameraName>,
+    messages: u64,
+    /// Messages of a newer major version.
+    newer: u64,
+}
+
+impl Contents {
+    fn note(&mut self, entry: &Entry) {
+        if let Channel::Bearings(camera) = &entry.key.channel
+            && !self.cameras.contains(camera)
+        {
+            self.cameras.insert(camera.clone());
+        }
+        let seen = glance(&entry.key.channel, &entry.data).ok().flatten();
+        self.messages += 1;
+        self.newer += u64::from(seen.is_some_and(|seen| !seen.is_readable));
     }
 }
 
@@ -86,7 +110,11 @@ struct Range {
 
 impl Range {
     /// The range that was asked for, counted from the recording's first bearing or track.
-    fn of(args: &Args, recalibration: Option<&Recalibration>) -> anyhow::Result<Self> {
+    fn of(
+        args: &Args,
+        recalibration: Option<&Recalibration>,
+        contents: &mut Contents,
+    ) -> anyhow::Result<Self> {
         let to_s = args.to.unwrap_or(f64::INFINITY);
         ensure!(
             args.from < to_s,
@@ -104,6 +132,7 @@ impl Range {
                 Some(recalibration) => recalibration.applied(entry),
                 None => entry,
             };
+            contents.note(&entry);
             if matches!(entry.key.channel, Channel::Bearings(_) | Channel::Tracks) {
                 first = Some(first.map_or(entry.data_time, |first| first.min(entry.data_time)));
                 last = last.max(Some(entry.data_time));

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{bail, ensure};
 use crossfix_fusion::Output;
-use crossfix_message::{Channel, Key, Payload, SiteName, Timestamp};
+use crossfix_message::{Channel, Key, Payload, SiteName, Timestamp, TrackEventKind};
 use crossfix_recording::{Entry, RecordingWriter, Source};
 
 use super::{Args, Range, calibrations};
@@ -25,6 +25,8 @@ struct OfflineFusion {
     centre: Centre,
     writer: RecordingWriter<std::io::BufWriter<std::fs::File>>,
     frames: u64,
+    /// Number of tracks that were confirmed.
+    targets: u64,
     /// Whether smoothed tracks are written.
     is_smoothed: bool,
     site: Option<SiteName>,
@@ -51,6 +53,7 @@ pub fn fuse(
         is_smoothed,
         writer: RecordingWriter::create(draft.path())?,
         frames: 0,
+        targets: 0,
         site: None,
         healthy_at: None,
         busy: Duration::ZERO,
@@ -107,7 +110,8 @@ pub fn fuse(
 /// What was found in a recording.
 struct Found {
     frames: u64,
-    track_frames: u64,
+    /// Number of tracks that were confirmed.
+    targets: u64,
     /// Why it is nothing, if that is known.
     why_nothing: Option<String>,
 }
@@ -115,7 +119,7 @@ struct Found {
 impl Found {
     fn ensure_any(&self) -> anyhow::Result<()> {
         let why = self.why_nothing.as_ref().map_or_else(String::new, |why| format!(": {why}"));
-        ensure!(self.track_frames > 0, "no target found in {} bearing frames{why}", self.frames);
+        ensure!(self.targets > 0, "no target found in {} bearing frames{why}", self.frames);
         Ok(())
     }
 }
@@ -155,6 +159,7 @@ impl OfflineFusion {
                     self.put(Channel::Tracks, time, frame.encode())?;
                 }
                 Output::Event(event) => {
+                    self.targets += u64::from(event.kind() == TrackEventKind::Confirmed);
                     let time = Timestamp::from_nanos(event.time_ns);
                     tracing::debug!("{time}: {event}");
                     self.put(Channel::Events, time, event.encode())?;
@@ -222,6 +227,6 @@ impl OfflineFusion {
             self.busy.as_secs_f64() * 1e6 / frames as f64,
             self.longest.as_secs_f64() * 1e3
         ));
-        Ok(Found { frames, track_frames, why_nothing: self.centre.why_nothing() })
+        Ok(Found { frames, targets: self.targets, why_nothing: self.centre.why_nothing() })
     }
 }

@@ -9,10 +9,10 @@ use crossfix_message::{
     BearingFrame, CameraName, Channel, CueFrame, Health, Key, Payload, Preview, Timestamp,
     TrackEvent, TrackFrame, TruthFrame, decode,
 };
-use crossfix_recording::{Entry, RecordingInfo};
+use crossfix_recording::Entry;
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
 
-use super::{Args, Range};
+use super::{Args, Contents, Range};
 use crate::config;
 use crate::network;
 use crate::output;
@@ -41,15 +41,20 @@ fn is_cameras(channel: &Channel) -> bool {
 }
 
 /// Publishes a range of a recording's bytes under the network's site.
-pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> {
+pub fn publish(
+    args: &Args,
+    network: &Path,
+    range: Range,
+    contents: &Contents,
+) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
     let network = config::load_network(network)?;
-    ensure_known(&args.recording, &network)?;
     let Some(link) =
         network::open(&network, &Role::Cameras { and_fusion: args.tracks }, &shutdown)?
     else {
         return Ok(());
     };
+    ensure_heard(&args.recording, contents, &network)?;
     tracing::info!("publishing as the cameras of `{}` in {RUN_UP_S} s", link.site());
     let delivery = if args.speed > 0.0 { Delivery::Queued } else { Delivery::Every };
     let mut stage =
@@ -90,24 +95,39 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
     Ok(())
 }
 
-/// Refuses a recording that the network's site cannot hear or read.
-fn ensure_known(recording: &Path, network: &NetworkConfig) -> anyhow::Result<()> {
-    let info = RecordingInfo::of(recording)?;
+/// Refuses a recording of which nobody on the network would hear or read anything, and says what
+/// they would not.
+fn ensure_heard(
+    recording: &Path,
+    contents: &Contents,
+    network: &NetworkConfig,
+) -> anyhow::Result<()> {
+    let &Contents { messages, newer, .. } = contents;
+    let recording = recording.display();
     ensure!(
-        info.newer == 0,
-        "{} messages of {} are of a newer version: update this side",
-        info.newer,
-        recording.display()
+        newer < messages,
+        "none of {messages} messages of {recording} can be read: they are of a newer version"
     );
-    let unknown = info.cameras.iter().filter(|camera| !network.cameras.contains_key(*camera));
-    let unknown: Vec<String> = unknown.map(|camera| format!("`{camera}`")).collect();
-    ensure!(
-        unknown.is_empty(),
-        "the network of site `{}` lacks cameras of {}: {}",
+    if newer > 0 {
+        tracing::warn!("{newer} of {messages} messages of {recording} are of a newer version");
+    }
+    let is_known = |camera: &&CameraName| network.cameras.contains_key(*camera);
+    let unknown: Vec<String> = contents
+        .cameras
+        .iter()
+        .filter(|camera| !is_known(camera))
+        .map(|camera| format!("`{camera}`"))
+        .collect();
+    if unknown.is_empty() {
+        return Ok(());
+    }
+    let said = format!(
+        "the network of site `{}` lacks cameras of {recording}: {}",
         network.site,
-        recording.display(),
         unknown.join(", ")
     );
+    ensure!(unknown.len() < contents.cameras.len(), said);
+    tracing::warn!("{said}");
     Ok(())
 }
 

@@ -7,6 +7,7 @@ use crossfix_simulation::{SimulatedSite, Site, SiteCamera};
 use nalgebra::{Matrix3, Vector3};
 use serde_json::json;
 
+use crate::commands::numbers;
 use crate::output::{self, Draft};
 use crate::scenario::{DetectionRow, ExposureRow, FORMAT, TruthRow, turned};
 use crate::shutdown::Shutdown;
@@ -21,19 +22,24 @@ pub struct SiteArgs {
     #[arg(long, default_value_t = 4, value_name = "N", requires = "scenario")]
     cameras: usize,
     /// How long it lasts, seconds.
-    #[arg(long, default_value_t = 20.0, value_name = "S", requires = "scenario")]
+    #[arg(long, default_value_t = 20.0, value_name = "S", requires = "scenario",
+          value_parser = numbers::seconds, allow_negative_numbers = true)]
     seconds: f64,
     /// Exposures a second of each camera.
-    #[arg(long, default_value_t = 10.0, value_name = "HZ", requires = "scenario")]
+    #[arg(long, default_value_t = 10.0, value_name = "HZ", requires = "scenario",
+          value_parser = numbers::rate, allow_negative_numbers = true)]
     rate_hz: f64,
     /// False bearings that an exposure brings in the mean.
-    #[arg(long, default_value_t = 1.0, value_name = "N", requires = "scenario")]
+    #[arg(long, default_value_t = 1.0, value_name = "N", requires = "scenario",
+          value_parser = numbers::mean_count, allow_negative_numbers = true)]
     clutter: f64,
     /// Probability that a camera reports a target in its image.
-    #[arg(long, default_value_t = 0.95, value_name = "P", requires = "scenario")]
+    #[arg(long, default_value_t = 0.95, value_name = "P", requires = "scenario",
+          value_parser = numbers::probability, allow_negative_numbers = true)]
     detection_probability: f64,
     /// Greatest rate of turn of the targets, radians a second; 0 is straight.
-    #[arg(long, default_value_t = 0.0, value_name = "RAD_PER_S", requires = "scenario")]
+    #[arg(long, default_value_t = 0.0, value_name = "RAD_PER_S", requires = "scenario",
+          value_parser = numbers::radians_per_second, allow_negative_numbers = true)]
     turn: f64,
     /// Seed of everything random.
     #[arg(long, default_value_t = 1, value_name = "N", requires = "scenario")]
@@ -58,12 +64,12 @@ impl SiteArgs {
 }
 
 /// A table of the scenario's folder that is complete once it is closed.
-struct Table {
+struct DraftTable {
     rows: csv::Writer<std::fs::File>,
     draft: Draft,
 }
 
-impl Table {
+impl DraftTable {
     fn new(dir: &Path, name: &str) -> anyhow::Result<Self> {
         let draft = Draft::new(&dir.join(name), &[])?;
         let rows = csv::Writer::from_path(draft.path())
@@ -77,18 +83,18 @@ impl Table {
     }
 }
 
-/// Writes `scenario.json`, `detections.csv`, `exposures.csv` and `truth.csv`, all or none; returns
-/// the number of exposures. Scoring times are those of the last camera's exposures.
+/// Writes `detections.csv`, `exposures.csv` and `truth.csv`, each when it is whole, and at last
+/// `scenario.json`; returns the number of exposures. Scoring times are those of the last camera's exposures.
 pub fn write(site: &SimulatedSite, dir: &Path, shutdown: &Shutdown) -> anyhow::Result<u64> {
     std::fs::create_dir_all(dir).with_context(|| format!("cannot make {}", dir.display()))?;
     let [mut detections, mut exposures, mut truth] = [
-        Table::new(dir, "detections.csv")?,
-        Table::new(dir, "exposures.csv")?,
-        Table::new(dir, "truth.csv")?,
+        DraftTable::new(dir, "detections.csv")?,
+        DraftTable::new(dir, "exposures.csv")?,
+        DraftTable::new(dir, "truth.csv")?,
     ];
     let mut epochs = Vec::new();
     for exposure in site.bearings() {
-        ensure!(!shutdown.requested(), "asked to stop");
+        ensure!(!shutdown.requested(), super::STOPPED);
         let (cam, scan) = (exposure.camera as u32, exposure.frame.sequence);
         // The frame's own time, rounded to a nanosecond.
         let t = exposure.frame.capture_time_ns as f64 / 1e9;

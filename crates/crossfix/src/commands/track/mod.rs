@@ -37,7 +37,7 @@ pub struct Args {
     video: PathBuf,
     /// A target in the first frame that is followed (see --from): left,top,width,height in pixels.
     /// May be given several times: the targets have the numbers 1, 2, ... in that order.
-    #[arg(long = "box", value_name = "X,Y,W,H")]
+    #[arg(long = "box", value_name = "X,Y,W,H", allow_hyphen_values = true)]
     places: Vec<BoxArg>,
     /// Find targets, beside those of the boxes. Without a box that is done anyway.
     #[arg(long)]
@@ -201,7 +201,7 @@ fn ensure_inside(places: &[BoxArg], image: &Plane) -> anyhow::Result<()> {
     let (width, height) = (image.width(), image.height());
     for BoxArg(PixelBox { x, y, width: wide, height: high }) in places {
         ensure!(
-            (-wide..width as f64).contains(x) && (-high..height as f64).contains(y),
+            x + wide > 0.0 && *x < width as f64 && y + high > 0.0 && *y < height as f64,
             "the box {x},{y},{wide},{high} lies outside the image of {width}x{height} pixels"
         );
     }

@@ -14,7 +14,7 @@ fn learnt(poses: [Option<Matrix6<f64>>; 3]) -> (Belief, Vec<usize>) {
     belief.advance(Timestamp::EPOCH);
     let components: Vec<usize> = ["b", "c"]
         .into_iter()
-        .filter_map(|c| belief.place(&name(c)))
+        .filter_map(|c| belief.index(&name(c)))
         .flat_map(|k| [k, k + 1])
         .collect();
     let mean = DVector::from_vec(vec![0.06, 1e-5, -0.03, 0.0]);
@@ -68,7 +68,7 @@ fn offsets_are_against_what_all_clocks_say_and_their_mean_stays_unknown() {
 fn a_doubted_clock_is_as_badly_known_as_it_was_reported_and_the_others_stay() {
     for doubted in ["a", "b"] {
         let (mut belief, _) = learnt([Some(Matrix6::identity() * 1e-6), None, None]);
-        belief.doubt(&name(doubted));
+        belief.widen(&name(doubted));
         assert!(of(&belief, doubted).relative_sd_s > 0.06, "{:?}", of(&belief, doubted));
         let (b, c) = (of(&belief, "b"), of(&belief, "c"));
         if doubted == "a" {
@@ -100,7 +100,7 @@ fn a_clock_that_says_that_it_has_become_worse_may_be_off_from_where_it_stood() {
     for reopened in ["a", "b"] {
         let (mut belief, _) = learnt([None; 3]);
         let before = ["a", "b", "c"].map(|camera| of(&belief, camera));
-        belief.reopen(&name(reopened), [0.5, 3e-5]);
+        belief.worsen(&name(reopened), [0.5, 3e-5]);
         for (camera, before) in ["a", "b", "c"].into_iter().zip(before) {
             let after = of(&belief, camera);
             // No clock's estimate steps, and only the reopened clock becomes uncertain.

@@ -47,7 +47,7 @@ fn after(
         let place = Vector3::from(place(t).coords);
         window.add(
             &name(camera),
-            Role::Wanted,
+            Role::Estimated,
             StampedLine { time: stamped, line, lasting: CorrelatedNoise::NONE, white: 1.0 },
             place,
         );

@@ -30,7 +30,7 @@ use crate::{Exposure, FusionConfig};
 
 /// A reading is confirmed if one target is likelier by this log-likelihood ratio than each camera
 /// seeing another target, and than any other reading of the same lines: a chance of 1 in 3000. With
-/// half of it (1 in 50) strangers are taken for the target.
+/// half of it (1 in 50) other targets are taken for it.
 const MARGIN: f64 = 8.0;
 /// A reading with a smaller log-likelihood ratio than this is given up. With half of it more true
 /// readings end with their first line, and none is tried again.
@@ -39,20 +39,23 @@ const GIVEN_UP: f64 = -5.0;
 /// largest range is taken for its range. With half of it that range is 0.7 times as long, which is
 /// little beside its uncertainty.
 const NEAREST_M: f64 = 30.0;
-/// Bounds on time. With half of them a target goes unfollowed where its camera sees ten other
-/// targets at a time.
-struct Most {
-    /// Directions that are followed in one camera.
+/// Bounds on time.
+struct HandoverBounds {
+    /// Directions that are followed in one camera. With half of it a target goes unfollowed where
+    /// its camera sees ten other targets at a time.
     seen: usize,
-    /// Lost directions that are tried in one exposure.
+    /// Lost directions that are tried in one exposure. With half of it, where more are lost at a
+    /// time, the earlier ones are tried an exposure later.
     lost: usize,
-    /// Readings of one direction at a time, ...
+    /// Readings of one direction at a time. With half of it the true one is not begun where two
+    /// other objects have come before it.
     readings: usize,
-    /// ... and others' lines that are tried with it.
+    /// Lines of other cameras that are tried with one direction. With half of it a direction that
+    /// was lost among many objects is not tried with those that come last.
     tried: usize,
 }
 
-const MOST: Most = Most { seen: 20, lost: 20, readings: 4, tried: 50 };
+const BOUNDS: HandoverBounds = HandoverBounds { seen: 20, lost: 20, readings: 4, tried: 50 };
 
 /// The directions that each camera follows alone, and their readings.
 #[derive(Debug)]
@@ -161,7 +164,7 @@ impl Handover {
         let (gate, mut begun, mut explained) = (self.rules.gate, Vec::new(), BTreeSet::new());
         let is_known = |i: usize| is_owned[i] || exposure.sightings[i].rooted == Rooted::Yes;
         // The best known directions choose first; a lost one takes only a line that is clearly no
-        // stranger's.
+        // other target's.
         let mut order: Vec<usize> = (0..seen.len()).collect();
         order.sort_by(|&a, &b| {
             seen[a].at(exposure.time).variance.total_cmp(&seen[b].at(exposure.time).variance)
@@ -202,7 +205,7 @@ impl Handover {
         // What a track or something rooted explains is no direction of its own any more.
         seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
         for (index, line) in with_pose.into_iter().enumerate() {
-            if !taken[index] && !is_known(index) && seen.len() < MOST.seen {
+            if !taken[index] && !is_known(index) && seen.len() < BOUNDS.seen {
                 self.count += 1;
                 seen.push(SeenDirection::first(self.count, line, exposure, index));
             }
@@ -233,14 +236,15 @@ impl Handover {
             })
             .collect();
         lost.sort_by_key(|(_, one)| Reverse(one.sight.time));
-        for (camera, one) in lost.into_iter().take(MOST.lost) {
+        for (camera, one) in lost.into_iter().take(BOUNDS.lost) {
             let since =
                 begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
             for &ContinuedLine { index, number, .. } in since.filter(|other| !is_owned[other.index])
             {
                 let name = (exposure.camera.clone(), exposure.sequence, index);
                 let is_read = one.readings.iter().any(|reading| reading.newest == name);
-                let is_full = one.readings.len() >= MOST.readings || one.tried.len() >= MOST.tried;
+                let is_full =
+                    one.readings.len() >= BOUNDS.readings || one.tried.len() >= BOUNDS.tried;
                 if is_read || is_full || !one.tried.insert(number) {
                     continue;
                 }

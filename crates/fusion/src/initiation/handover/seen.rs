@@ -17,8 +17,8 @@ use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, Tracking};
 
 /// Standard deviation of a direction's turning rate, rad/s: 45 m/s at 150 m. With half of it, what
-/// flies past a camera is lost again and again; with twice as much, strangers (other objects) are
-/// taken for it.
+/// flies past a camera is lost again and again; with twice as much, other objects are taken
+/// for it.
 const TURNING_SD: f64 = 0.3;
 /// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, which is lively. With half of
 /// it, what turns hard is lost; with twice as much, two directions are too soon alike.
