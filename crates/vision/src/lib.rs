@@ -58,6 +58,7 @@ mod search_area;
 mod search_memory;
 mod sighting;
 mod state;
+mod surroundings;
 mod tracker;
 
 use std::fmt;

@@ -8,12 +8,12 @@ use crossfix_correlation::Plane;
 use crossfix_filter::AxisMeasurement;
 
 use crate::appearance::Appearance;
-use crate::centring::Surroundings;
 use crate::crop::crop;
 use crate::frame::FrameInput;
 use crate::likelihood::Expectation;
 use crate::motion::ImageMotion;
 use crate::scratch::Scratch;
+use crate::surroundings::Surroundings;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Images without the target after which it is searched for: noise hides it in one image and not

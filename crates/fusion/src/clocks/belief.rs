@@ -213,9 +213,8 @@ impl Belief {
                 _ if walked == 0.0 => {}
                 Some(index) => self.covariance[(index, index)] += walked,
                 None => {
-                    for (&k, &l) in indices.iter().flat_map(|k| indices.iter().map(move |l| (k, l)))
-                    {
-                        self.covariance[(k, l)] += walked;
+                    for &k in indices {
+                        indices.iter().for_each(|&l| self.covariance[(k, l)] += walked);
                     }
                 }
             }
