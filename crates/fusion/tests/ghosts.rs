@@ -6,7 +6,7 @@
 mod common;
 
 use common::{Path, Scene, found, fusion_of, site, straight};
-use crossfix_fusion::{Fusion, FusionConfig, TrackStatus};
+use crossfix_fusion::{Fusion, FusionConfig, Track, TrackStatus};
 use crossfix_message::BearingFrame;
 use nalgebra::{Point3, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -119,6 +119,13 @@ fn a_track_that_only_one_of_the_cameras_goes_on_seeing_is_a_direction_and_says_s
     }
 }
 
+/// Whether a track is more than four of its own deviations from where the target is.
+fn is_far_off(track: &Track, path: &Path) -> bool {
+    let error = track.state().position() - path(track.updated.seconds()).unwrap();
+    let spread = track.state().position_covariance().cholesky().unwrap();
+    error.dot(&spread.solve(&error)) > 16.0
+}
+
 /// Flies straight until a time, then accelerates by 3 m/s^2 for three seconds along the sight line
 /// of the first camera.
 fn along_the_sight_line(x: f64, onset_s: f64) -> Path {
@@ -145,9 +152,7 @@ fn what_a_target_does_along_the_last_cameras_sight_line_lies_within_what_is_clai
             }
             fusion.ingest(&frame);
             for track in fusion.tracks().filter(|track| track.is_confirmed() && time > 9.0) {
-                let error = track.state().position() - path()(track.updated.seconds()).unwrap();
-                let spread = track.state().position_covariance().cholesky().unwrap();
-                far_off += usize::from(error.dot(&spread.solve(&error)) > 16.0);
+                far_off += usize::from(is_far_off(track, &path()));
                 answers += 1;
             }
         }
@@ -193,9 +198,7 @@ fn near_a_noisy_camera_that_is_left_alone_no_range_is_made_up() {
             }
             fusion.ingest(&frame);
             for track in fusion.tracks().filter(|track| track.is_confirmed() && time > 9.5) {
-                let error = track.state().position() - path()(track.updated.seconds()).unwrap();
-                let spread = track.state().position_covariance().cholesky().unwrap();
-                far_off += usize::from(error.dot(&spread.solve(&error)) > 16.0);
+                far_off += usize::from(is_far_off(track, &path()));
                 answers += 1;
             }
         }

@@ -8,8 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use crossfix_geometry::{Pixel, PixelCovariance};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, Channel, ClockSource, ImageTrackState, Key,
-    Payload, SiteName, Timestamp,
+    BearingFrame, CameraCalibration, Channel, ClockSource, Key, Payload, SiteName, Timestamp,
 };
 use crossfix_recording::{Entry, RecordingWriter, Source};
 use crossfix_simulation::{Scene, SimulatedCamera, World};
@@ -20,7 +19,7 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::commands::agent::truth_frame;
 use crate::commands::numbers;
 use crate::config;
-use crate::import::imported;
+use crate::import::{imported, labelled};
 use crate::output::{self, Draft};
 use crate::pace::wall_seconds;
 use crate::shutdown::Shutdown;
@@ -173,18 +172,7 @@ impl SimulatedBearings<'_> {
                 Pixel::new(exact.x() + noise_px * normal(), exact.y() + noise_px * normal());
             let bearing =
                 camera.camera().model().bearing(pixel, PixelCovariance::isotropic(noise_px))?;
-            tracks.push(BearingTrack {
-                track_id: target.id,
-                bearing: Some(bearing.direction().into_inner().into()),
-                covariance_xx: bearing.covariance().m11,
-                covariance_xy: bearing.covariance().m12,
-                covariance_yy: bearing.covariance().m22,
-                pixel_x: pixel.x(),
-                pixel_y: pixel.y(),
-                score: 1.0,
-                state: ImageTrackState::Tracking.into(),
-                ..Default::default()
-            });
+            tracks.push(labelled(target.id, &bearing, pixel));
         }
         let time = begins.plus_seconds(t);
         let message = BearingFrame {

@@ -10,14 +10,14 @@ use crossfix_geometry::{
     Bearing, Camera, CameraModel, Distortion, GeometryError, ImageSize, Intrinsics, Pixel, Pose,
 };
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
-    ImageTrackState, Key, Payload, SiteName, Timestamp, TrueState, TruthFrame,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource, Key, Payload,
+    SiteName, Timestamp, TrueState, TruthFrame,
 };
 use crossfix_recording::Entry;
 use nalgebra::{Matrix2, Matrix3, Point3, Vector3};
 use serde::Deserialize;
 
-use crate::import::{imported, read_text};
+use crate::import::{imported, labelled, read_text};
 
 /// Frame rate to which the published synchronisation refers, Hz.
 const SYNC_RATE: f64 = 59.94006;
@@ -389,18 +389,7 @@ fn bearing_track(
 ) -> Result<BearingTrack, GeometryError> {
     let direction = model.direction(pixel)?;
     let bearing = Bearing::new(direction.into_inner(), Matrix2::identity() * sigma.powi(2))?;
-    Ok(BearingTrack {
-        track_id: 1,
-        bearing: Some(bearing.direction().into_inner().into()),
-        covariance_xx: bearing.covariance().m11,
-        covariance_xy: bearing.covariance().m12,
-        covariance_yy: bearing.covariance().m22,
-        pixel_x: pixel.x(),
-        pixel_y: pixel.y(),
-        score: 1.0,
-        state: ImageTrackState::Tracking.into(),
-        ..Default::default()
-    })
+    Ok(labelled(1, &bearing, pixel))
 }
 
 /// The truth of the wanted RTK seconds, without the masked samples.

@@ -67,8 +67,7 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let recalibration = args.calibration.as_deref().map(Recalibration::load).transpose()?;
-    let mut contents = Contents::default();
-    let range = Range::of(args, recalibration.as_ref(), &mut contents)?;
+    let (range, contents) = Range::of(args, recalibration.as_ref())?;
     match (&args.output, &args.network) {
         (Some(output), _) => offline::fuse(args, output, range, recalibration),
         (None, Some(network)) => online::publish(args, network, range, &contents),
@@ -109,12 +108,10 @@ struct Range {
 }
 
 impl Range {
-    /// The range that was asked for, counted from the recording's first bearing or track.
-    fn of(
-        args: &Args,
-        recalibration: Option<&Recalibration>,
-        contents: &mut Contents,
-    ) -> anyhow::Result<Self> {
+    /// The range that was asked for, counted from the recording's first bearing or track, and what
+    /// the recording holds; that is not looked at where all of it is fused.
+    fn of(args: &Args, recalibration: Option<&Recalibration>) -> anyhow::Result<(Self, Contents)> {
+        let mut contents = Contents::default();
         let to_s = args.to.unwrap_or(f64::INFINITY);
         ensure!(
             args.from < to_s,
@@ -123,7 +120,8 @@ impl Range {
         let is_whole = args.from == 0.0 && args.to.is_none();
         if is_whole && args.fuse {
             // When all of it is fused, beginning and end do not matter.
-            return Ok(Self { from: Timestamp::EPOCH, to: Timestamp::EPOCH, is_whole });
+            let range = Self { from: Timestamp::EPOCH, to: Timestamp::EPOCH, is_whole };
+            return Ok((range, contents));
         }
         let mut first: Option<Timestamp> = None;
         let mut last: Option<Timestamp> = None;
@@ -150,7 +148,7 @@ impl Range {
             args.recording.display(),
             last.seconds_since(first)
         );
-        Ok(Self { from, to, is_whole })
+        Ok((Self { from, to, is_whole }, contents))
     }
 
     /// Whether an entry lies in the range.

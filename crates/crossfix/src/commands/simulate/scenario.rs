@@ -84,7 +84,8 @@ impl DraftTable {
 }
 
 /// Writes `detections.csv`, `exposures.csv` and `truth.csv`, each when it is whole, and at last
-/// `scenario.json`; returns the number of exposures. Scoring times are those of the last camera's exposures.
+/// `scenario.json`; returns the number of exposures. Scoring times are those of the last camera's
+/// exposures.
 pub fn write(site: &SimulatedSite, dir: &Path, shutdown: &Shutdown) -> anyhow::Result<u64> {
     std::fs::create_dir_all(dir).with_context(|| format!("cannot make {}", dir.display()))?;
     let [mut detections, mut exposures, mut truth] = [
