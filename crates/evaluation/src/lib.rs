@@ -18,6 +18,7 @@
 //! assert_eq!(report.completeness, 1.0);
 //! ```
 
+mod ablation;
 pub mod bound;
 mod history;
 mod latency;
@@ -26,6 +27,7 @@ mod papers;
 mod sightings;
 mod stretches;
 
+pub use ablation::{ClipAblation, ClipTrials, ablate_drawn};
 pub use history::TrackHistory;
 pub use latency::{Latency, LatencyRecorder};
 pub use metrics::{Estimate, Evaluator, Nees, Report, TargetReport, TrueTarget};

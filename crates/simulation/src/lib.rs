@@ -16,6 +16,7 @@
 
 mod circuit;
 mod clock;
+mod clutter;
 mod mount;
 mod path;
 mod render;
@@ -26,6 +27,7 @@ mod sky;
 mod world;
 
 pub use clock::SimulatedClock;
+pub use clutter::SceneClutter;
 pub use mount::{MountState, SceneMount, SimulatedMount};
 pub use path::FlightPath;
 pub use render::RenderedFrame;

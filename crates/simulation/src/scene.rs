@@ -1,4 +1,5 @@
 use std::collections::BTreeSet;
+use std::ops::RangeInclusive;
 
 use crossfix_geometry::{Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pose};
 use crossfix_message::CameraName;
@@ -6,7 +7,7 @@ use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::{FlightPath, SceneMount, SimulatedClock, World};
+use crate::{FlightPath, SceneClutter, SceneMount, SimulatedClock, World};
 
 /// A scene as it is written in a file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,6 +22,9 @@ pub struct Scene {
     pub targets: Vec<SceneTarget>,
     /// The cameras.
     pub cameras: Vec<SceneCamera>,
+    /// What the cameras see beside the targets: in images alone, not in bearings.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub clutter: Vec<SceneClutter>,
 }
 
 /// A target of a scene.
@@ -93,6 +97,15 @@ pub enum SceneError {
         /// The target.
         target: u64,
     },
+    /// A thing beside the targets with impossible numbers.
+    #[error(
+        "thing {index} of the clutter has a number that is not finite, a size that is not positive, \
+         or a brightness outside 0 to 255 levels"
+    )]
+    Clutter {
+        /// Its place in the list, from 0.
+        index: usize,
+    },
     /// Two cameras of the same name or two targets of the same number.
     #[error("`{name}` is there twice")]
     Twice {
@@ -146,75 +159,63 @@ impl Scene {
     }
 
     fn check(&self) -> Result<(), SceneError> {
-        let number = |what: String, value: f64, good: bool, must| {
-            if good { Ok(()) } else { Err(SceneError::Number { what, value, must }) }
-        };
-        let positive = |value: f64| value.is_finite() && value > 0.0;
         let lasts = self.duration_s;
-        number("duration_s".into(), lasts, positive(lasts) && lasts < 1e5, "from 0 to 100000 s")?;
+        number(
+            "duration_s".into(),
+            lasts,
+            is_positive(lasts) && lasts < 1e5,
+            "from 0 to 100000 s",
+        )?;
         let mut seen = BTreeSet::new();
         for target in &self.targets {
-            let whose = |key: &str| format!("{key} of target {}", target.id);
-            number(
-                whose("span_m"),
-                target.span_m,
-                positive(target.span_m),
-                "a positive number of metres",
-            )?;
-            if !target.path.is_possible() {
-                return Err(SceneError::Path { target: target.id });
-            }
+            target.check()?;
             if !seen.insert(format!("target {}", target.id)) {
                 return Err(SceneError::Twice { name: format!("target {}", target.id) });
             }
         }
         for camera in &self.cameras {
-            let whose = |key: &str| format!("{key} of camera {}", camera.name);
-            let rate = camera.rate_hz;
-            number(
-                whose("rate_hz"),
-                rate,
-                (0.01..=1000.0).contains(&rate),
-                "from 0.01 to 1000 frames a second",
-            )?;
-            let noise = camera.noise_levels;
-            number(
-                whose("noise_levels"),
-                noise,
-                (0.0..=100.0).contains(&noise),
-                "from 0 to 100 levels",
-            )?;
-            let blur = camera.blur_px;
-            number(whose("blur_px"), blur, (0.0..=20.0).contains(&blur), "from 0 to 20 px")?;
-            let exposure = camera.exposure_s;
-            number(
-                whose("exposure_s"),
-                exposure,
-                (0.0..=1.0).contains(&exposure),
-                "from 0 to 1 s",
-            )?;
-            if let Some(mount) = &camera.mount {
-                let rate = mount.rate_deg_per_s;
-                number(
-                    whose("mount.rate_deg_per_s"),
-                    rate,
-                    (0.01..=1000.0).contains(&rate),
-                    "from 0.01 to 1000 degrees a second",
-                )?;
-                let sd = mount.angle_sd_mrad;
-                number(
-                    whose("mount.angle_sd_mrad"),
-                    sd,
-                    (0.0..=100.0).contains(&sd),
-                    "from 0 to 100 mrad",
-                )?;
-            }
-            let most = camera.size_px.iter().copied().max().unwrap_or(0);
-            number(whose("size_px"), f64::from(most), most <= 8192, "at most 8192 px")?;
+            camera.check()?;
             if !seen.insert(camera.name.to_string()) {
                 return Err(SceneError::Twice { name: camera.name.to_string() });
             }
         }
-        Ok(())
+        let impossible = self.clutter.iter().position(|thing| !thing.is_possible());
+        impossible.map_or(Ok(()), |index| Err(SceneError::Clutter { index }))
     }
+}
+
+impl SceneTarget {
+    fn check(&self) -> Result<(), SceneError> {
+        let span = format!("span_m of target {}", self.id);
+        number(span, self.span_m, is_positive(self.span_m), "a positive number of metres")?;
+        if self.path.is_possible() { Ok(()) } else { Err(SceneError::Path { target: self.id }) }
+    }
+}
+
+impl SceneCamera {
+    fn check(&self) -> Result<(), SceneError> {
+        let in_range = |key: &str, value: f64, range: RangeInclusive<f64>, must: &'static str| {
+            number(format!("{key} of camera {}", self.name), value, range.contains(&value), must)
+        };
+        in_range("rate_hz", self.rate_hz, 0.01..=1000.0, "from 0.01 to 1000 frames a second")?;
+        in_range("noise_levels", self.noise_levels, 0.0..=100.0, "from 0 to 100 levels")?;
+        in_range("blur_px", self.blur_px, 0.0..=20.0, "from 0 to 20 px")?;
+        in_range("exposure_s", self.exposure_s, 0.0..=1.0, "from 0 to 1 s")?;
+        if let Some(SceneMount { rate_deg_per_s: rate, angle_sd_mrad: sd, .. }) = self.mount {
+            let turns = "from 0.01 to 1000 degrees a second";
+            in_range("mount.rate_deg_per_s", rate, 0.01..=1000.0, turns)?;
+            in_range("mount.angle_sd_mrad", sd, 0.0..=100.0, "from 0 to 100 mrad")?;
+        }
+        let most = self.size_px.iter().copied().max().unwrap_or(0);
+        in_range("size_px", f64::from(most), 0.0..=8192.0, "at most 8192 px")
+    }
+}
+
+fn is_positive(value: f64) -> bool {
+    value.is_finite() && value > 0.0
+}
+
+/// An error where a number is not good.
+fn number(what: String, value: f64, good: bool, must: &'static str) -> Result<(), SceneError> {
+    if good { Ok(()) } else { Err(SceneError::Number { what, value, must }) }
 }

@@ -5,9 +5,11 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use crate::render::{RenderedTarget, draw};
+use crate::render::{RenderedShape, RenderedTarget, draw};
 use crate::sky::{Panorama, sky};
-use crate::{RenderedFrame, Scene, SceneCamera, SceneError, SceneTarget, SimulatedMount};
+use crate::{
+    RenderedFrame, Scene, SceneCamera, SceneClutter, SceneError, SceneTarget, SimulatedMount,
+};
 
 /// True state of a target.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,6 +30,12 @@ pub struct World {
     duration_s: f64,
 }
 
+/// A thing before a camera.
+enum InView {
+    Target(RenderedTarget),
+    Clutter(RenderedShape),
+}
+
 /// A camera of a scene.
 #[derive(Clone, Debug)]
 pub struct SimulatedCamera {
@@ -38,6 +46,7 @@ pub struct SimulatedCamera {
     panorama: Option<Panorama>,
     seed: u64,
     targets: Vec<SceneTarget>,
+    clutter: Vec<SceneClutter>,
     duration_s: f64,
 }
 
@@ -95,6 +104,7 @@ impl SimulatedCamera {
             panorama: mount.map(|_| Panorama::new(seed)),
             seed,
             targets: scene.targets.clone(),
+            clutter: scene.clutter.clone(),
             duration_s: scene.duration_s,
         })
     }
@@ -159,9 +169,10 @@ impl SimulatedCamera {
     fn render(&self, index: u64, camera: &Camera, mut image: Vec<f32>) -> RenderedFrame {
         let [width, height] = self.description.size_px.map(|side| side as usize);
         let true_s = self.true_time(index);
-        for target in &self.targets {
-            if let Some(appearance) = self.appearance(camera, target, true_s) {
-                draw(&mut image, width, height, &appearance);
+        for thing in self.in_view(camera, true_s) {
+            match thing {
+                InView::Target(target) => draw(&mut image, width, height, &target),
+                InView::Clutter(shape) => shape.draw(&mut image, width, self.description.blur_px),
             }
         }
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
@@ -176,6 +187,20 @@ impl SimulatedCamera {
             .collect();
         let own_s = self.description.clock.own(true_s);
         RenderedFrame { index, true_s, own_s, width, height, brightness }
+    }
+
+    /// All that is before the camera at a time, the farthest first: what is nearer hides it.
+    fn in_view(&self, camera: &Camera, t: f64) -> Vec<InView> {
+        let mut things: Vec<(f64, InView)> = Vec::new();
+        for target in &self.targets {
+            let range = (target.path.state(t).0 - camera.pose().position()).norm();
+            let appearance = self.appearance(camera, target, t);
+            things.extend(appearance.map(|appearance| (range, InView::Target(appearance))));
+        }
+        let shapes = self.clutter.iter().flat_map(|thing| thing.shapes(camera, t));
+        things.extend(shapes.map(|(range, shape)| (range, InView::Clutter(shape))));
+        things.sort_by(|(one, _), (other, _)| other.total_cmp(one));
+        things.into_iter().map(|(_, thing)| thing).collect()
     }
 
     /// How a target appears in the image at a time; `None` before it exists, or if it is behind the

@@ -17,6 +17,7 @@ use crate::frame::FrameInput;
 use crate::scratch::Scratch;
 use crate::state::{CUT_OUT_SHAPE, TargetBelief};
 use crate::surroundings::{FIRST_LOOK, Surroundings};
+use crate::tracker_part::TrackerPart;
 use crate::{ImagePoint, PixelBox, ReferenceStrategy, TrackerConfig};
 
 /// Standard deviation of a figure's middle about the target's own, px per axis: of eight targets
@@ -27,7 +28,9 @@ impl TargetBelief {
     /// Begins to look for the target's figure in the mean of its images, if the first one alone
     /// does not show the target clearly.
     pub(crate) fn begin_centring(&mut self, config: &TrackerConfig) {
-        let may_change = config.box_sd_px > 0.0 && config.reference != ReferenceStrategy::Fixed;
+        let may_change = config.box_sd_px > 0.0
+            && config.reference != ReferenceStrategy::Fixed
+            && config.has(TrackerPart::MeanFigure);
         if may_change && self.appearance.is_anchor_noisy() {
             self.surroundings = Surroundings::new(self.appearance.sides(), config).map(Box::new);
         }

@@ -4,7 +4,7 @@ use crossfix_correlation::{Extent, Similarity, SpectralWeight};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::ReferenceStrategy;
+use crate::{ReferenceStrategy, TrackerPart};
 
 /// How targets are followed. Lengths in pixels, brightness in the image's own unit, times in
 /// seconds.
@@ -68,6 +68,10 @@ pub struct TrackerConfig {
     /// Finds targets by itself. Absent (default): only given boxes are followed, and found again
     /// where they are lost.
     pub detector: Option<DetectorConfig>,
+    /// A part that is left out ([`Self::without`]), to measure what it brings. Not a setting: no
+    /// file has it. Default: none.
+    #[serde(skip)]
+    pub left_out: Option<TrackerPart>,
 }
 
 /// How a target's place is decided.
@@ -162,6 +166,7 @@ impl Default for TrackerConfig {
             give_up_after_s: 0.5,
             paper: PaperConfig::default(),
             detector: None,
+            left_out: None,
         }
     }
 }

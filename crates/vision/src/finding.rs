@@ -11,6 +11,7 @@ use crate::followed::{Followed, Follower, Origin, box_of, describe};
 use crate::frame::{FrameInput, TargetStep};
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
+    TrackerPart,
 };
 
 /// Most candidates, things that are followed because they may be a lost target: each costs as much
@@ -203,6 +204,7 @@ impl ImageTracker {
             self.detector = None;
             self.followed.retain(|followed| !followed.is_candidate());
         } else if self.detector.is_none()
+            && self.config.has(TrackerPart::StandIns)
             && self.followed.iter().any(|f| !f.is_candidate() && f.target.is_searching())
         {
             self.detector = Some(Detector::new(DetectorConfig::default()));

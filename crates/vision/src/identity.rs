@@ -6,9 +6,10 @@ use crate::arrival::PlacedReference;
 use crate::fit::TargetFit;
 use crate::frame::FrameInput;
 use crate::motion::ImageMotion;
-use crate::scene::{SceneMemory, ScenePicture};
+use crate::scene::ScenePicture;
 use crate::scratch::Scratch;
 use crate::state::TargetBelief;
+use crate::tracker_part::TrackerPart;
 
 /// How long a target that was found again must have been seen before it is believed, s: until then
 /// a mistake costs what is known of where it went, and nothing is learnt of it. With half of it a
@@ -141,6 +142,9 @@ impl Identity {
         place: ImagePoint,
         scratch: &mut Scratch,
     ) -> f64 {
+        if !frame.config.has(TrackerPart::Arrival) {
+            return 0.0;
+        }
         let placed = PlacedReference {
             reference: state.appearance.working.image(),
             energy: f64::from(state.appearance.energy()),
@@ -208,7 +212,11 @@ impl Identity {
         // Images that follow each other sooner tell no more than one would.
         let share = (frame.interval / NEWS_S).min(1.0);
         let placements = scratch.ratios.samples().len() as f64;
-        let above_noise = above_noise_log_ratio(state, fit.contrast, placements);
+        let above_noise = if frame.config.has(TrackerPart::UsualContrast) {
+            above_noise_log_ratio(state, fit.contrast, placements)
+        } else {
+            0.0
+        };
         let log_ratio =
             share * (self.arrival_log_ratio(state, frame, fit.place, scratch) + above_noise);
         // Prediction of the chain towards its stationary share, then Bayes' rule.
@@ -220,13 +228,13 @@ impl Identity {
     }
 
     /// Begins a probation: a search has found something.
-    pub(crate) fn begin_probation(&mut self, state: &TargetBelief, scene: &SceneMemory) {
-        self.probation = Some(Probation {
+    pub(crate) fn begin_probation(&mut self, state: &TargetBelief, frame: FrameInput<'_>) {
+        self.probation = frame.config.has(TrackerPart::Probation).then(|| Probation {
             motion: state.motion.clone(),
             unseen_s: state.unseen_s,
             last_seen: state.last_seen,
             missed: state.missed,
-            picture: scene.newest(),
+            picture: frame.scene.newest(),
             seen_s: 0.0,
         });
         self.probability = FOUND;

@@ -5,6 +5,7 @@ use crate::fit::TargetFit;
 use crate::frame::FrameInput;
 use crate::scratch::Scratch;
 use crate::state::{SEEN, TargetBelief};
+use crate::tracker_part::TrackerPart;
 
 /// Averaging time of the usual contrast, s: longer than a cloud takes it away. With half of it one
 /// second at a cloud's edge takes it half-way to the dimmed contrast, instead of 28 % of the way.
@@ -48,12 +49,12 @@ impl TargetBelief {
         certainty: f64,
         scratch: &mut Scratch,
     ) -> f32 {
-        let FrameInput { image, interval, .. } = frame;
+        let FrameInput { image, interval, config, .. } = frame;
         if certainty < LEAST_CERTAINTY[0] {
             return 0.0;
         }
         let seen = certainty > SEEN;
-        if seen {
+        if seen && config.has(TrackerPart::FollowedContrast) {
             let clear = f64::from(self.appearance.clear_share());
             // The reference's noise is taken out: z / clear, with the variance v / (E clear^2).
             let measured = fit.contrast / clear;

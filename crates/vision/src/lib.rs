@@ -60,6 +60,7 @@ mod sighting;
 mod state;
 mod surroundings;
 mod tracker;
+mod tracker_part;
 
 use std::fmt;
 
@@ -69,6 +70,7 @@ pub use config::{
 pub use frame::Measurement;
 pub use reference::{ImmConfig, PixelImm, ReferenceStrategy};
 pub use tracker::{ImageTrack, ImageTracker, TrackPhase};
+pub use tracker_part::TrackerPart;
 
 /// Number of a 2D track, unique within its image stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]

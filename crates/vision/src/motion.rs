@@ -134,6 +134,11 @@ impl ImageMotion {
         }
     }
 
+    /// The same motion, all of whose models are the liveliest one.
+    pub(crate) fn of_the_liveliest(self) -> Self {
+        Self { accelerations: [self.accelerations[0]; WAYS], ..self }
+    }
+
     /// Restarts at rest where the reference is found; what is known of its offset is kept.
     pub(crate) fn restart(&mut self, found: [AxisMeasurement; 2], velocity_sd: f64) {
         for (axis, AxisMeasurement { position, variance }) in self.all.iter_mut().zip(found) {

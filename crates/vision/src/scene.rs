@@ -147,9 +147,16 @@ pub(crate) struct SceneMemory {
     glance: RowGlance,
     /// Shift of the scene since the beginning, when the newest picture was taken, px.
     turned: [f64; 2],
+    /// Whether the camera is taken to stand still: no picture is registered.
+    stands_still: bool,
 }
 
 impl SceneMemory {
+    /// The memory of a camera that may turn, or of one that is taken to stand still.
+    pub(crate) fn new(may_turn: bool) -> Self {
+        Self { stands_still: !may_turn, ..Self::default() }
+    }
+
     /// The pictures, the newest first.
     pub(crate) fn pictures(&self) -> impl Iterator<Item = &ScenePicture> {
         self.pictures.iter()
@@ -197,7 +204,9 @@ impl SceneMemory {
         smooth(&mut self.coarse, &mut self.between);
         let Some((newest, others)) = self.pictures.split_first_mut() else { return };
         let before = newest.shift;
-        newest.shift = turned(&self.coarse, &newest.coarse, before);
+        if !self.stands_still {
+            newest.shift = turned(&self.coarse, &newest.coarse, before);
+        }
         self.is_still =
             newest.shift.iter().zip(before).all(|(now, before)| (now - before).abs() < STILL_PX);
         for picture in others {
@@ -218,7 +227,7 @@ impl SceneMemory {
             return None;
         }
         // Each picture is registered itself, so that errors do not add up from picture to picture.
-        for picture in &mut self.pictures {
+        for picture in self.pictures.iter_mut().filter(|_| !self.stands_still) {
             picture.shift = turned(&self.coarse, &picture.coarse, picture.shift);
         }
         self.turned = self.turned();

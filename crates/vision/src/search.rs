@@ -15,6 +15,7 @@ use crate::scratch::Scratch;
 use crate::search_area::{BestCell, SearchArea};
 use crate::search_memory::{Background, SearchMap, SearchMemory};
 use crate::state::TargetBelief;
+use crate::tracker_part::TrackerPart;
 
 /// Probability in one place from which on the map has found the target. With 0.9 one drawn sequence
 /// in forty is lost for good, as something else is found and followed; with 0.999 an eighth more of
@@ -77,7 +78,8 @@ impl Sought<'_> {
             if searches / 2 % 2 == 1 {
                 self.memory.take_first(self.state, frame.config, &mut scratch.buffers);
             }
-            let is_turn = searches.is_multiple_of(2);
+            let is_turn =
+                searches.is_multiple_of(2) && frame.config.has(TrackerPart::SearchInChange);
             if is_turn { self.find_in_change(frame, scratch) } else { None }
         });
         if found.is_none() {
@@ -96,7 +98,7 @@ impl Sought<'_> {
             whole_ratios(self.state, frame.image, &coarse, frame.config, scratch);
         let area = SearchArea::whole(self.state, sides, coarse.coarseness);
         let turned = frame.scene.turned();
-        let seen = self.state.in_snapshot;
+        let seen = self.state.in_snapshot.filter(|_| frame.config.has(TrackerPart::EmptyScene));
         if let Some(scene) = seen.and_then(|at| area.empty_scene(sides, turned, at, self.memory)) {
             scene.subtract_from(&mut scratch.ratios);
         }

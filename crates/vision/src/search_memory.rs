@@ -14,6 +14,7 @@ use crate::TrackerConfig;
 use crate::appearance::{Appearance, AppearanceScratch};
 use crate::place_map::PlaceMap;
 use crate::state::TargetBelief;
+use crate::tracker_part::TrackerPart;
 
 /// Correlation below which two appearances are different: on the real and drawn cases those of
 /// targets that have not changed correlate by 0.94 or more, and 0.65 to 0.78 where the last one
@@ -97,7 +98,7 @@ impl SearchMemory {
         config: &TrackerConfig,
         buffers: &mut AppearanceScratch,
     ) -> bool {
-        if state.unseen_s < LAST_ALONE_S {
+        if state.unseen_s < LAST_ALONE_S || !config.has(TrackerPart::FirstAppearance) {
             return false;
         }
         let last = &state.appearance;

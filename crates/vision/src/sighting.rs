@@ -104,7 +104,7 @@ impl Target {
         }
         self.hypotheses.clear();
         self.state.forget_surroundings();
-        self.identity.begin_probation(&self.state, frame.scene);
+        self.identity.begin_probation(&self.state, frame);
         self.state.motion.restart(fit.found(), frame.config.search_velocity_sd_px);
         self.seen(fit.place);
         TargetStep {

@@ -14,6 +14,7 @@ use crate::likelihood::Expectation;
 use crate::motion::ImageMotion;
 use crate::scratch::Scratch;
 use crate::surroundings::Surroundings;
+use crate::tracker_part::TrackerPart;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Images without the target after which it is searched for: noise hides it in one image and not
@@ -81,13 +82,12 @@ impl TargetBelief {
         // Error of drawing the box, and of its middle as the target's own place.
         let variance = config.given_sd_px.powi(2) + config.centre_sd_px.powi(2);
         let given = [centre.x, centre.y].map(|position| AxisMeasurement { position, variance });
+        let motion =
+            ImageMotion::at_rest(given, config.start_velocity_sd_px, config.acceleration_sd_px);
+        let has_models = config.has(TrackerPart::MotionModels);
         Self {
             appearance: Appearance::new(image, place, noise, config, &mut scratch.buffers),
-            motion: ImageMotion::at_rest(
-                given,
-                config.start_velocity_sd_px,
-                config.acceleration_sd_px,
-            ),
+            motion: if has_models { motion } else { motion.of_the_liveliest() },
             hidden: 0.0,
             noise,
             contrast: 1.0,

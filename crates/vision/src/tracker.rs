@@ -14,7 +14,7 @@ use crate::followed::{Followed, Follower, Origin, describe};
 use crate::frame::{FrameInput, Measurement};
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
-use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig, TrackerConfigError};
+use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig, TrackerConfigError, TrackerPart};
 
 /// Bounds of the time between images, s; other intervals are clamped to them: after a longer pause
 /// nothing is known of a target anyway, and no camera is faster. With half of the first a camera of
@@ -134,11 +134,12 @@ impl ImageTracker {
     pub fn new(config: TrackerConfig) -> Result<Self, TrackerConfigError> {
         config.validate()?;
         let detector = config.detector.clone().map(Detector::new);
+        let may_turn = config.has(TrackerPart::CameraTurns);
         Ok(Self {
             config,
             scratch: Scratch::default(),
             snapshot: None,
-            scene: SceneMemory::default(),
+            scene: SceneMemory::new(may_turn),
             detector,
             waiting: Vec::new(),
             followed: Vec::new(),

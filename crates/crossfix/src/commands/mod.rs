@@ -6,6 +6,8 @@ pub mod agent;
 pub mod check;
 pub mod doctor;
 pub mod info;
+#[cfg(any(feature = "centre", feature = "viewer"))]
+pub mod labels;
 pub mod numbers;
 pub mod record;
 pub mod recover;

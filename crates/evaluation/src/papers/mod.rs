@@ -13,6 +13,8 @@ mod positioning;
 mod runs;
 mod table;
 
+pub(crate) use runs::{Noise, all as all_runs};
+pub(crate) use table::mean;
 pub use table::{Limit, Table, TableRow, Verdict};
 
 /// Extent of the simulation.

@@ -10,6 +10,7 @@ use crate::motion::ImageMotion;
 use crate::posterior::Posterior;
 use crate::scratch::Scratch;
 use crate::state::SEEN;
+use crate::tracker_part::TrackerPart;
 
 /// Turns of the camera by less than this are within the uncertainty of a target's motion anyway,
 /// px. With half of it small errors of the registration fork the hypotheses too, each at the cost
@@ -25,6 +26,7 @@ impl Target {
         let is_followed = !self.state.is_searching() && !self.identity.is_on_probation();
         if is_followed
             && by[0].hypot(by[1]) >= LEAST_MOVE_PX
+            && frame.config.has(TrackerPart::SeveralPlaces)
             && matches!(frame.config.gate, GateRule::Innovation { .. })
         {
             self.hypotheses.begin(&self.state);
@@ -36,6 +38,7 @@ impl Target {
     pub(super) fn must_doubt(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
         let in_doubt = !self.hypotheses.is_empty() || posterior.near.mass < DOUBT;
         in_doubt
+            && config.has(TrackerPart::SeveralPlaces)
             && matches!(config.gate, GateRule::Innovation { .. })
             && !self.identity.is_on_probation()
     }

@@ -32,7 +32,7 @@ impl Target {
     fn find_again(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetStep> {
         let Self { state, identity, search_memory: memory, .. } = self;
         let fit = Sought { state, identity, memory }.find(frame, scratch)?;
-        self.identity.begin_probation(&self.state, frame.scene);
+        self.identity.begin_probation(&self.state, frame);
         let (found, expected) = (fit.found(), self.state.motion.found());
         let is_near = |i: usize| {
             (found[i].position - expected[i].position).powi(2) < MANOEUVRE * expected[i].variance

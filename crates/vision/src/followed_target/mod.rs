@@ -24,6 +24,7 @@ use crate::posterior::{Posterior, PosteriorPart};
 use crate::scratch::Scratch;
 use crate::search_memory::SearchMemory;
 use crate::state::{SEEN, TargetBelief};
+use crate::tracker_part::TrackerPart;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Variance below which a fit is narrower than the map's pixels, px^2. With half of it fits of 0.5
@@ -243,7 +244,8 @@ impl Target {
             self.state.missed += 1;
             return step(None);
         }
-        if certainty > SEEN && distance > MANOEUVRE {
+        let may_widen = frame.config.has(TrackerPart::Manoeuvres);
+        if may_widen && certainty > SEEN && distance > MANOEUVRE {
             // Certain, but not where it was expected: the filters are overconfident.
             let off = |i: usize| {
                 (found[i].position - expected[i].position).powi(2) / expected[i].variance
@@ -263,7 +265,9 @@ impl Target {
         let (estimate, hidden) = (self.state.position(), posterior.unseen);
         if certainty > SEEN {
             self.seen(estimate);
-            self.state.motion.match_noise(distance);
+            if frame.config.has(TrackerPart::MatchedNoise) {
+                self.state.motion.match_noise(distance);
+            }
         } else {
             self.state.missed += 1;
         }

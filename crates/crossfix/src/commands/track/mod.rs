@@ -166,7 +166,7 @@ fn follow(
 ) -> anyhow::Result<Counted> {
     let mut repeats = Repeats::default();
     let mut counted = Counted::default();
-    while let Some((index, read)) = next(source, &mut repeats)? {
+    while let Some((index, read)) = next_frame(source, &mut repeats)? {
         counted.length = index + 1;
         if index < args.from {
             continue;
@@ -225,7 +225,7 @@ fn tracker(args: &Args) -> anyhow::Result<ImageTracker> {
 }
 
 /// The next frame and its number, without the frame if it cannot be decoded; `None` at the end.
-fn next(
+pub(crate) fn next_frame(
     source: &mut dyn FrameSource,
     repeats: &mut Repeats,
 ) -> anyhow::Result<Option<(u64, Option<Frame>)>> {

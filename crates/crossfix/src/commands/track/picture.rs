@@ -3,18 +3,19 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use crossfix_correlation::Plane;
 use crossfix_video::Frame;
 use crossfix_view::{FollowedTarget, ImageBox, Sight, TrackingPicture};
 use crossfix_vision::{ImageTrack, PixelBox, TrackPhase};
 
+use crate::commands::labels::read_labels;
 use crate::eye;
 
 /// A picture of the tracker's work, with labels to compare it with.
 pub(super) struct Picture {
     picture: TrackingPicture,
-    labels: BTreeMap<u64, ImageBox>,
+    labels: BTreeMap<u64, PixelBox>,
 }
 
 impl Picture {
@@ -38,17 +39,15 @@ impl Picture {
         let jpeg =
             eye::jpeg(&bytes, image.width(), image.height()).context("cannot encode a picture")?;
         let targets: Vec<FollowedTarget> = tracks.iter().map(followed).collect();
-        let label = self.labels.get(&frame.index).copied();
+        let label = self.labels.get(&frame.index).map(|label| image_box(*label));
         self.picture.show(frame.capture.time, jpeg, &targets, label).context("cannot draw a frame")
     }
 }
 
 fn followed(track: &ImageTrack) -> FollowedTarget {
-    let PixelBox { x, y, width, height } =
-        PixelBox::about(track.position, track.width, track.height);
     FollowedTarget {
         number: track.id.0,
-        place: ImageBox { x, y, width, height },
+        place: image_box(PixelBox::about(track.position, track.width, track.height)),
         // In Rerun whole numbers are the upper left corners of pixels, not their centres.
         measured: track.measured.map(|m| [m.place.x + 0.5, m.place.y + 0.5]),
         sight: match track.phase {
@@ -62,28 +61,6 @@ fn followed(track: &ImageTrack) -> FollowedTarget {
     }
 }
 
-/// The boxes of a table of labels; a row without a box is a frame without a target.
-fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, ImageBox>> {
-    let context = || format!("cannot read the labels in {}", path.display());
-    let mut reader = csv::Reader::from_path(path).with_context(context)?;
-    let columns: Vec<String> =
-        reader.headers().with_context(context)?.iter().map(str::to_owned).collect();
-    for name in ["frame", "x", "y", "w", "h"] {
-        if !columns.iter().any(|column| column.trim() == name) {
-            bail!("{} has no column `{name}`; it needs frame,x,y,w,h", path.display());
-        }
-    }
-    let mut labels = BTreeMap::new();
-    for record in reader.records() {
-        let record = record.with_context(context)?;
-        let value = |name: &str| -> Option<f64> {
-            let index = columns.iter().position(|column| column.trim() == name)?;
-            record.get(index)?.trim().parse().ok()
-        };
-        let place = (value("frame"), value("x"), value("y"), value("w"), value("h"));
-        if let (Some(frame), Some(x), Some(y), Some(width), Some(height)) = place {
-            labels.insert(frame as u64, ImageBox { x, y, width, height });
-        }
-    }
-    Ok(labels)
+fn image_box(PixelBox { x, y, width, height }: PixelBox) -> ImageBox {
+    ImageBox { x, y, width, height }
 }

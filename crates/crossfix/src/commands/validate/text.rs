@@ -75,6 +75,9 @@ pub fn table(table: &Table) -> String {
 pub fn summary(tables: &[Table]) -> String {
     let rows = || tables.iter().flat_map(|table| &table.rows);
     let asked = rows().filter(|row| row.verdict() != Verdict::Information).count();
+    if asked == 0 {
+        return format!("{} figures, of which nothing is asked", rows().count());
+    }
     let failed = rows().filter(|row| row.verdict() == Verdict::Fail).count();
     format!(
         "{} of {asked} figures are what they must be ({} figures in all)",

@@ -1,0 +1,72 @@
+//! A tracker on one target of which the truth is known.
+
+use crossfix_correlation::Plane;
+use crossfix_message::Timestamp;
+use crossfix_vision::{ImageTrackId, ImageTracker, PixelBox, TrackerConfig};
+
+use super::is_claimed;
+
+/// Distance of the centres up to which a frame counts as followed, px: the limit of the project's
+/// other figures on videos. With half of it loose labels count as losses.
+const NEAR_PX: f64 = 10.0;
+/// Distance beyond which a track is on something else, px: it cannot overlap a small target. With
+/// half of it a loose label counts as something else.
+const FAR_PX: f64 = 20.0;
+/// The number of the one target that is given.
+const GIVEN: ImageTrackId = ImageTrackId(1);
+
+/// What became of one trial.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct TrialScore {
+    labelled: u32,
+    near: u32,
+    /// Longest time for which something else was claimed to be the target, s.
+    pub(super) longest_wrong_s: f64,
+}
+
+impl TrialScore {
+    /// Share of the labelled frames in which the target was not followed.
+    pub(super) fn lost(&self) -> f64 {
+        1.0 - f64::from(self.near) / f64::from(self.labelled)
+    }
+}
+
+/// A tracker on one target.
+#[derive(Debug)]
+pub(super) struct Trial {
+    tracker: ImageTracker,
+    score: TrialScore,
+    /// Since when something else has been claimed to be the target.
+    wrong_since: Option<Timestamp>,
+}
+
+impl Trial {
+    /// A trial that begins with the next image; `None` if the configuration is impossible.
+    pub(super) fn new(config: TrackerConfig, given: PixelBox) -> Option<Self> {
+        let mut tracker = ImageTracker::new(config).ok()?;
+        tracker.take_up(given);
+        Some(Self { tracker, score: TrialScore::default(), wrong_since: None })
+    }
+
+    /// Follows the target into an image in which it is in a box, if that is known.
+    pub(super) fn step(&mut self, image: &Plane, time: Timestamp, label: Option<PixelBox>) {
+        let tracks = self.tracker.step(image, time);
+        let claimed = tracks.iter().find(|track| track.id == GIVEN && is_claimed(track));
+        let Some(truth) = label.map(|label| label.centre()) else { return };
+        let off =
+            claimed.map(|track| (track.position.x - truth.x).hypot(track.position.y - truth.y));
+        self.score.labelled += 1;
+        self.score.near += u32::from(off.is_some_and(|off| off <= NEAR_PX));
+        if off.is_some_and(|off| off > FAR_PX) {
+            let since = *self.wrong_since.get_or_insert(time);
+            let wrong_s = time.seconds_since(since);
+            self.score.longest_wrong_s = self.score.longest_wrong_s.max(wrong_s);
+        } else {
+            self.wrong_since = None;
+        }
+    }
+
+    pub(super) fn score(self) -> TrialScore {
+        self.score
+    }
+}
