@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use crossfix_recording::RecordingWriter;
 
-use crate::import::drone_tracking::{Sample, SplitPart};
+use crate::import::drone_tracking::{RtkSample, SplitPart};
 use crate::import::{drone_tracking, scenario};
 use crate::output::{self, Draft};
 
@@ -99,9 +99,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 /// Writes positions as a log that `calibrate flight --log` reads.
-fn write_log(path: &Path, samples: &[Sample]) -> anyhow::Result<()> {
+fn write_log(path: &Path, samples: &[RtkSample]) -> anyhow::Result<()> {
     let mut text = String::from("time_s,east_m,north_m,up_m\n");
-    for (time_s, place) in samples {
+    for RtkSample { time_s, place } in samples {
         text += &format!("{time_s:.3},{:.4},{:.4},{:.4}\n", place.x, place.y, place.z);
     }
     output::write_file(path, &[], text.as_bytes())
