@@ -264,17 +264,17 @@ impl RecordFiles {
         let folder = self.asked.parent().filter(|folder| !folder.as_os_str().is_empty());
         let Ok(entries) = std::fs::read_dir(folder.unwrap_or(Path::new("."))) else { return };
         let (stem, extension) = parts(&self.asked);
-        let begins_at = |name: &str| -> Option<String> {
-            let begins = name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&extension)?;
-            is_a_beginning(begins).then(|| begins.to_owned())
-        };
         let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
         let mut found: Vec<(usize, String, PathBuf)> = names
             .filter_map(|name| {
                 let path = self.asked.with_file_name(&name);
                 // Files of this run are ordered by their end, and are all younger than others.
                 let ended = self.ended.iter().position(|ended| *ended == path);
-                Some((ended.map_or(0, |place| place + 1), begins_at(&name)?, path))
+                Some((
+                    ended.map_or(0, |place| place + 1),
+                    begins_at(&name, &stem, &extension)?,
+                    path,
+                ))
             })
             .filter(|(_, _, path)| path != self.path() && path.is_file())
             .collect();
@@ -282,6 +282,12 @@ impl RecordFiles {
         self.older =
             found.into_iter().rev().map(|(_, _, path)| (path.clone(), bytes(&path))).collect();
     }
+}
+
+/// The time in a file's name between two parts of it, if it is of that form.
+fn begins_at(name: &str, stem: &str, extension: &str) -> Option<String> {
+    let begins = name.strip_prefix(stem)?.strip_prefix('-')?.strip_suffix(extension)?;
+    is_a_beginning(begins).then(|| begins.to_owned())
 }
 
 /// Whether a text is the time in a file's name, with a number after it if two files began in one

@@ -119,10 +119,6 @@ impl<P> Pictures<P> {
     /// Takes tracks in: if one of them is confirmed, coasting or of one camera, returns all waiting
     /// pictures, in their order, to be recorded.
     pub fn see(&mut self, tracks: &TrackFrame, now: Instant) -> impl Iterator<Item = P> + '_ {
-        let is_sure = |state| {
-            use TrackState::{Coasting, Confirmed, OneCamera};
-            matches!(state, Confirmed | Coasting | OneCamera)
-        };
         let wanted = if tracks.tracks.iter().any(|track| is_sure(track.state())) {
             self.forget(now);
             self.until = Some(now + self.after);
@@ -133,6 +129,11 @@ impl<P> Pictures<P> {
         };
         self.waiting.drain(..wanted).map(|waiting| waiting.picture)
     }
+}
+
+fn is_sure(state: TrackState) -> bool {
+    use TrackState::{Coasting, Confirmed, OneCamera};
+    matches!(state, Confirmed | Coasting | OneCamera)
 }
 
 #[cfg(test)]
