@@ -3,8 +3,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_calibration::{
-    CalibratedCamera, CameraLabels, FlightResult, Label, LensFreedom, SiteCalibration,
-    SurveyedLandmark, calibrate_flight,
+    CalibratedCamera, CameraLabels, FlightLog, FlightResult, Label, LensFreedom, SiteCalibration,
+    Survey, SurveyedLandmark, calibrate_flight,
 };
 use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
 use crossfix_message::{
@@ -133,12 +133,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let worth = held_out
         .map(|part| part.fused(&args.recording, SiteCalibration::from(&believed), log.as_ref()))
         .transpose()?;
-    let calibrated: Vec<&CameraName> = result.cameras.iter().map(|camera| &camera.name).collect();
-    let rests = if log.is_none() || survey.tells_size(&calibrated) {
-        Rests::OnSurvey
-    } else {
-        Rests::OnLogAlone
-    };
+    let rests = rests(&result, log.as_ref(), &survey);
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
@@ -166,6 +161,16 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     take_out_wrong(&mut result)?;
     args.write(&result)?;
     drawn
+}
+
+/// What determines the size and position of the calibrated site.
+fn rests(result: &FlightResult, log: Option<&FlightLog>, survey: &Survey) -> Rests {
+    let calibrated: Vec<&CameraName> = result.cameras.iter().map(|camera| &camera.name).collect();
+    if log.is_none() || survey.tells_size(&calibrated) {
+        Rests::OnSurvey
+    } else {
+        Rests::OnLogAlone
+    }
 }
 
 /// Removes wrong cameras from a calibration, and refuses one that is wrong as a whole.
@@ -420,11 +425,13 @@ fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, RecordedCa
 
 /// The targets that a frame measured, with its time by the camera's own clock.
 fn measured(frame: &BearingFrame, time_s: f64) -> impl Iterator<Item = Label> + '_ {
-    let is_measured = |track: &&BearingTrack| {
-        track.state() == ImageTrackState::Tracking
-            && track.pixel_x.is_finite()
-            && track.pixel_y.is_finite()
-    };
+    let measured = frame.tracks.iter().filter(|track| is_measured(track));
     let pixel = |track: &BearingTrack| Pixel::new(track.pixel_x, track.pixel_y);
-    frame.tracks.iter().filter(is_measured).map(move |track| Label { time_s, pixel: pixel(track) })
+    measured.map(move |track| Label { time_s, pixel: pixel(track) })
+}
+
+fn is_measured(track: &BearingTrack) -> bool {
+    track.state() == ImageTrackState::Tracking
+        && track.pixel_x.is_finite()
+        && track.pixel_y.is_finite()
 }
