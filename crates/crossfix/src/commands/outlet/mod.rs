@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail, ensure};
 use crossfix_geometry::Geodetic;
 use crossfix_message::{
-    CameraCalibration, Channel, Key, Timestamp, TrackEvent, TrackFrame, decode,
+    CameraCalibration, Channel, Key, SiteName, Timestamp, TrackEvent, TrackFrame, decode,
 };
 use crossfix_outlet::{
     Asterix, CursorOnTarget, GeoJsonLines, Outlet, Sapient, Situation, Snapshot,
@@ -122,6 +122,19 @@ impl Format {
     }
 }
 
+impl Args {
+    /// What writes the format.
+    fn outlet(&self, site: &SiteName) -> anyhow::Result<Box<dyn Outlet>> {
+        Ok(match self.format {
+            Format::Cot => Box::new(self.formats.cot_type.clone()),
+            Format::Sapient => Box::new(Sapient::of_site(site.clone())),
+            Format::Asterix => Box::new(self.formats.asterix_source.clone()),
+            Format::Geojson => Box::new(GeoJsonLines),
+            Format::Foxglove => bail!("Foxglove is served"),
+        })
+    }
+}
+
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
     let network = config::load_network(&args.config)?;
@@ -141,13 +154,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         args.format != Format::Sapient || args.to.answers(),
         "SAPIENT waits for an answer: --to tcp://HOST:PORT or tls://HOST:PORT"
     );
-    let mut outlet: Box<dyn Outlet> = match args.format {
-        Format::Cot => Box::new(args.formats.cot_type.clone()),
-        Format::Sapient => Box::new(Sapient::of_site(site.clone())),
-        Format::Asterix => Box::new(args.formats.asterix_source.clone()),
-        Format::Geojson => Box::new(GeoJsonLines),
-        Format::Foxglove => bail!("Foxglove is served"),
-    };
+    let mut outlet = args.outlet(&site)?;
     let tls = matches!(args.to, Destination::Tls(_)).then(|| args.tls.client()).transpose()?;
     let mut carrier = Carrier::new(args.to.clone(), tls);
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
