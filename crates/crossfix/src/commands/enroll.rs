@@ -52,6 +52,16 @@ pub struct Args {
     revoke: Option<Identity>,
 }
 
+impl Args {
+    /// Whether a certificate is to be issued for it.
+    fn means(&self, identity: &Identity) -> bool {
+        match &self.revoke {
+            Some(revoked) => identity == revoked,
+            None => self.only.is_empty() || self.only.contains(identity),
+        }
+    }
+}
+
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let folder = args.config.parent().unwrap_or(Path::new("."));
     let before = load_network(&args.config)?;
@@ -66,13 +76,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let authority_folder = args.authority.clone().unwrap_or_else(|| folder.join(AUTHORITY));
     let authority = authority(&authority_folder, &security, &before.site)?;
 
-    let is_meant = |identity: &&Identity| match &args.revoke {
-        Some(revoked) => *identity == revoked,
-        None => args.only.is_empty() || args.only.contains(identity),
-    };
     let holds = DAY * args.days;
     let mut rows = vec![["component", "host", "until", "files"].map(str::to_owned).to_vec()];
-    for (identity, hosts) in hosts.iter().filter(|(identity, _)| is_meant(identity)) {
+    for (identity, hosts) in hosts.iter().filter(|(identity, _)| args.means(identity)) {
         let name = security.common_name(identity);
         let issued = authority.issue(&name, hosts, OffsetDateTime::now_utc(), holds)?;
         write(&security, identity, &issued)?;
@@ -204,14 +210,15 @@ fn private_folder(folder: &Path) -> anyhow::Result<()> {
 
 /// Writes a file that only its owner may read.
 fn write_private(path: &Path, text: &str) -> anyhow::Result<()> {
+    try_to_write_private(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn try_to_write_private(path: &Path, text: &str) -> std::io::Result<()> {
     let part = path.with_extension("part");
-    let write = || -> std::io::Result<()> {
-        let _ = fs::remove_file(&part);
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&part)?;
-        file.write_all(text.as_bytes())?;
-        fs::rename(&part, path)
-    };
-    write().with_context(|| format!("cannot write {}", path.display()))
+    let _ = fs::remove_file(&part);
+    let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&part)?;
+    file.write_all(text.as_bytes())?;
+    fs::rename(&part, path)
 }
 
 fn write(security: &Security, identity: &Identity, issued: &Issued) -> anyhow::Result<()> {

@@ -8,7 +8,7 @@ use crossfix_evaluation::{
     TrueTarget,
 };
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Datum, Timestamp, TrackFrame, TruthFrame,
+    BearingFrame, CameraCalibration, Channel, Datum, Timestamp, TrackFrame, TrueState, TruthFrame,
 };
 use serde::Serialize;
 
@@ -153,14 +153,16 @@ impl EvaluatedRun {
 }
 
 fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
-    let target = |state: &crossfix_message::TrueState| {
-        Some(TrueTarget {
-            id: state.id,
-            position: state.position?.into(),
-            velocity: state.velocity?.into(),
-        })
-    };
     frame.targets.iter().filter_map(target).collect()
+}
+
+/// A target whose position and velocity are known.
+fn target(state: &TrueState) -> Option<TrueTarget> {
+    Some(TrueTarget {
+        id: state.id,
+        position: state.position?.into(),
+        velocity: state.velocity?.into(),
+    })
 }
 
 /// Evaluates a recording.

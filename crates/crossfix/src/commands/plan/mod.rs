@@ -3,7 +3,7 @@ mod geojson;
 mod picture;
 mod report;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_evaluation::bound::{Assumptions, PlannedCamera, TargetSize, Volume};
@@ -120,26 +120,6 @@ impl Args {
 impl Args {
     /// The site's cameras, with values from the options in place of those from their files.
     fn cameras(&self) -> anyhow::Result<Vec<PlannedCamera>> {
-        let planned = |(path, file): (PathBuf, config::CameraFile)| {
-            let rate_hz = file.rate_hz()?;
-            if let Some(rate_hz) = rate_hz {
-                ensure!(
-                    (0.01..=1000.0).contains(&rate_hz),
-                    "{}: {rate_hz} frames a second: it must be from 0.01 to 1000",
-                    path.display()
-                );
-            }
-            let mut camera = planned::of_file(&file, &path, rate_hz)?;
-            camera.clock_sd_s = self.clock_sd.unwrap_or(camera.clock_sd_s);
-            camera.pixel_sd_px = self.pixel_sd.unwrap_or(camera.pixel_sd_px);
-            let rotation_sd_rad = self.rotation_sd_deg.map(f64::to_radians);
-            for (first, sd) in [(0, rotation_sd_rad), (3, self.position_sd)] {
-                if let Some(sd) = sd {
-                    planned::hold(&mut camera.pose_covariance, first, sd);
-                }
-            }
-            Ok(camera)
-        };
         let (turned, still): (Vec<_>, Vec<_>) = config::load_cameras(&self.site)?
             .into_iter()
             .partition(|(_, file)| file.mount.is_some());
@@ -149,7 +129,28 @@ impl Args {
                 file.name
             );
         }
-        still.into_iter().map(planned).collect()
+        still.iter().map(|(path, file)| self.camera(path, file)).collect()
+    }
+
+    fn camera(&self, path: &Path, file: &config::CameraFile) -> anyhow::Result<PlannedCamera> {
+        let rate_hz = file.rate_hz()?;
+        if let Some(rate_hz) = rate_hz {
+            ensure!(
+                (0.01..=1000.0).contains(&rate_hz),
+                "{}: {rate_hz} frames a second: it must be from 0.01 to 1000",
+                path.display()
+            );
+        }
+        let mut camera = planned::of_file(file, path, rate_hz)?;
+        camera.clock_sd_s = self.clock_sd.unwrap_or(camera.clock_sd_s);
+        camera.pixel_sd_px = self.pixel_sd.unwrap_or(camera.pixel_sd_px);
+        let rotation_sd_rad = self.rotation_sd_deg.map(f64::to_radians);
+        for (first, sd) in [(0, rotation_sd_rad), (3, self.position_sd)] {
+            if let Some(sd) = sd {
+                planned::hold(&mut camera.pose_covariance, first, sd);
+            }
+        }
+        Ok(camera)
     }
 }
 

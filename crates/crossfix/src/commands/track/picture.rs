@@ -8,6 +8,7 @@ use crossfix_correlation::Plane;
 use crossfix_video::Frame;
 use crossfix_view::{FollowedTarget, ImageBox, Sight, TrackingPicture};
 use crossfix_vision::{ImageTrack, PixelBox, TrackPhase};
+use csv::StringRecord;
 
 use crate::eye;
 
@@ -62,13 +63,15 @@ fn followed(track: &ImageTrack) -> FollowedTarget {
     }
 }
 
+const LABEL_COLUMNS: [&str; 5] = ["frame", "x", "y", "w", "h"];
+
 /// The boxes of a table of labels; a row without a box is a frame without a target.
 fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, ImageBox>> {
     let context = || format!("cannot read the labels in {}", path.display());
     let mut reader = csv::Reader::from_path(path).with_context(context)?;
     let columns: Vec<String> =
         reader.headers().with_context(context)?.iter().map(str::to_owned).collect();
-    for name in ["frame", "x", "y", "w", "h"] {
+    for name in LABEL_COLUMNS {
         if !columns.iter().any(|column| column.trim() == name) {
             bail!("{} has no column `{name}`; it needs frame,x,y,w,h", path.display());
         }
@@ -76,14 +79,16 @@ fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, ImageBox>> {
     let mut labels = BTreeMap::new();
     for record in reader.records() {
         let record = record.with_context(context)?;
-        let value = |name: &str| -> Option<f64> {
-            let index = columns.iter().position(|column| column.trim() == name)?;
-            record.get(index)?.trim().parse().ok()
-        };
-        let place = (value("frame"), value("x"), value("y"), value("w"), value("h"));
-        if let (Some(frame), Some(x), Some(y), Some(width), Some(height)) = place {
+        let row = LABEL_COLUMNS.map(|name| value(&record, &columns, name));
+        if let [Some(frame), Some(x), Some(y), Some(width), Some(height)] = row {
             labels.insert(frame as u64, ImageBox { x, y, width, height });
         }
     }
     Ok(labels)
+}
+
+/// The number that a row has in a column.
+fn value(record: &StringRecord, columns: &[String], name: &str) -> Option<f64> {
+    let index = columns.iter().position(|column| column.trim() == name)?;
+    record.get(index)?.trim().parse().ok()
 }
