@@ -48,26 +48,32 @@ const SETTLING_S: f64 = 1.5;
 /// Renders what three cameras see of two UAVs, runs an agent a camera, the fusion centre and the
 /// recorder as processes joined by Zenoh on this machine, and holds the tracks against the truth.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix demo --duration 20 --output demo-output\n  crossfix demo --live\n  crossfix demo --hand-off"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix demo --duration 20 --output demo-output\n  \
+    crossfix demo --live\n  \
+    crossfix demo --hand-off")]
 pub struct Args {
     /// Seed of sky and noise.
     #[arg(long, default_value_t = 1, value_name = "N")]
     seed: u64,
     /// How long the scene lasts, seconds.
-    #[arg(long, default_value_t = 25.0, value_name = "SECONDS", value_parser = numbers::demo_seconds,
-          allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 25.0,
+        value_name = "SECONDS",
+        value_parser = numbers::demo_seconds,
+        allow_negative_numbers = true
+    )]
     duration: f64,
     /// The folder to write recording, picture, configurations and logs to.
     #[arg(short, long, default_value = "demo-output", value_name = "DIR")]
     output: PathBuf,
-    /// Let the cameras be network cameras: agents that know nothing of the scene watch their streams
-    /// (RTSP, H.264), are told the cameras' clocks by them, and find the targets.
+    /// Let the cameras be network cameras: agents that know nothing of the scene watch their
+    /// streams (RTSP, H.264), are told the cameras' clocks by them, and find the targets.
     #[arg(long)]
     live: bool,
-    /// Let a fourth camera, with a narrow view on a mount that turns, look for the targets where the
-    /// fusion centre tells it to.
+    /// Let a fourth camera, with a narrow view on a mount that turns, look for the targets where
+    /// the fusion centre tells it to.
     #[arg(long, conflicts_with = "live")]
     hand_off: bool,
     /// Open the live viewer (Rerun), where one is installed.

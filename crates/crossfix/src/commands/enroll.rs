@@ -26,23 +26,29 @@ const DAY: Duration = Duration::from_secs(24 * 3600);
 
 /// Make or renew a site's certificates, and secure its network by them.
 ///
-/// The first time it makes the site's certificate authority and adds `[security]` to the network file:
-/// from then on every link is encrypted, and each component may say only what is its own.
+/// The first time it makes the site's certificate authority and adds `[security]` to the network
+/// file: from then on every link is encrypted, and each component may say only what is its own.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix enroll -c my-site/network.toml\n  crossfix enroll -c my-site/network.toml --only camera-north\n  crossfix enroll -c my-site/network.toml --revoke camera-north"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix enroll -c my-site/network.toml\n  \
+    crossfix enroll -c my-site/network.toml --only camera-north\n  \
+    crossfix enroll -c my-site/network.toml --revoke camera-north")]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// The folder of the authority, whose key can let anybody in: it stays here. Default: `authority`
-    /// beside the network's file.
+    /// The folder of the authority, whose key can let anybody in: it stays here. Default:
+    /// `authority` beside the network's file.
     #[arg(long, value_name = "FOLDER")]
     authority: Option<PathBuf>,
     /// How long the certificates hold, days. A component says that it is time to renew when a third
     /// is left.
-    #[arg(long, value_name = "DAYS", default_value_t = 90, value_parser = clap::value_parser!(u32).range(1..=3650))]
+    #[arg(
+        long,
+        value_name = "DAYS",
+        default_value_t = 90,
+        value_parser = clap::value_parser!(u32).range(1..=3650)
+    )]
     days: u32,
     /// Only these: camera-NAME, fusion, recorder, router, viewer.
     #[arg(long, value_name = "NAME", conflicts_with = "revoke")]

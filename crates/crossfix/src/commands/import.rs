@@ -8,9 +8,10 @@ use crate::output::{self, Draft};
 
 /// Turn published data sets into recordings.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap\n  crossfix import scenario DIR -o scenario.mcap"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
+    --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
+    crossfix import scenario DIR -o scenario.mcap")]
 pub struct Args {
     #[command(subcommand)]
     source: Source,
@@ -23,8 +24,13 @@ enum Source {
     /// Data times are RTK seconds from the Unix epoch, or with --raw the seconds that each camera
     /// counts by its frames.
     #[command(
-        after_help = "Examples:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
-                      crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG --part calibration --raw --log-out rtk.csv -o cal.mcap"
+        override_usage = "crossfix import drone-tracking-datasets [OPTIONS] \\\n           \
+            --dataset <N> --cameras <NAMES> --output <FILE> <DIR>",
+        after_help = "Examples:\n  \
+        crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
+        --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
+        crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
+        --cameras gopro3,sony5100,sonyG --part calibration --raw --log-out rtk.csv -o cal.mcap"
     )]
     DroneTrackingDatasets {
         /// The folder with calibration/, poses.json and datasetN/.

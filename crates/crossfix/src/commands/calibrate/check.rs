@@ -26,14 +26,14 @@ const LEAST_WATCHED_S: f64 = 20.0;
 /// A camera that has been turned by two milliradians is named after a minute of targets that it and
 /// two others see. The exit code is 1 if one does not fit.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix calibrate check last-night.mcap\n  crossfix calibrate check raw.mcap -c my-site"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix calibrate check last-night.mcap\n  \
+    crossfix calibrate check raw.mcap -c my-site")]
 pub struct Args {
     /// A recording (MCAP) of targets that several cameras see.
     recording: PathBuf,
-    /// The calibration, or the site's folder with `calibration.toml` in it, in the place of what was
-    /// recorded: of a recording that was made without one.
+    /// The calibration, or the site's folder with `calibration.toml` in it, in the place of what
+    /// was recorded: of a recording that was made without one.
     #[arg(short, long, value_name = "PATH")]
     config: Option<PathBuf>,
     /// Print JSON.

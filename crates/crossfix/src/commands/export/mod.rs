@@ -18,13 +18,18 @@ use crate::recorded::{self, Lacks};
 /// metres, metres per second, what the track is (confirmed or coasting; with --all also tentative
 /// and one-camera), how many cameras have given it a bearing within the second before, the root of
 /// the sum of the position's variances, metres, and the standard deviation of t, which is not in
-/// these: what all clocks are off by together, seconds. With --times, the state of each track at those
-/// times from its last frame at or before them, extrapolated with its velocity.
+/// these: what all clocks are off by together, seconds. With --times, the state of each track at
+/// those times from its last frame at or before them, extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
 #[command(
+    override_usage = "crossfix export [OPTIONS] <RECORDING> \\\n           \
+        <--csv|--geojson|--kml|--cot|--sapient|--asterix|--foxglove> <FILE> ...",
     group = clap::ArgGroup::new("written").required(true).multiple(true)
         .args(["csv", "geojson", "kml", "cot", "sapient", "asterix", "foxglove"]),
-    after_help = "Examples:\n  crossfix export tracks.mcap --csv tracks.csv --times times.csv\n  crossfix export tracks.mcap --kml flights.kml --anchor 48.3538,11.7861,490\n  crossfix export site.mcap --foxglove shown.mcap"
+    after_help = "Examples:\n  \
+        crossfix export tracks.mcap --csv tracks.csv --times times.csv\n  \
+        crossfix export tracks.mcap --kml flights.kml --anchor 48.3538,11.7861,490\n  \
+        crossfix export site.mcap --foxglove shown.mcap"
 )]
 pub struct Args {
     /// The recording (MCAP) with tracks.

@@ -27,7 +27,13 @@ pub struct OtherFormats {
     #[arg(long, value_name = "FILE", requires = "anchor")]
     kml: Option<PathBuf>,
     /// With --kml: how high the geoid (mean sea level) is above the ellipsoid there, metres.
-    #[arg(long, value_name = "METRES", default_value_t = 0.0, value_parser = numbers::height_difference, allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "METRES",
+        default_value_t = 0.0,
+        value_parser = numbers::height_difference,
+        allow_hyphen_values = true
+    )]
     geoid: f64,
     /// Write events of Cursor on Target, one after the other.
     #[arg(long, value_name = "FILE", requires = "anchor")]
@@ -38,8 +44,8 @@ pub struct OtherFormats {
     /// Write blocks of ASTERIX category 062.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     asterix: Option<PathBuf>,
-    /// Write the recording again with Foxglove's schemas beside ours (MCAP): it opens in Foxglove and
-    /// Rerun without Crossfix.
+    /// Write the recording again with Foxglove's schemas beside ours (MCAP): it opens in Foxglove
+    /// and Rerun without Crossfix.
     #[arg(long, value_name = "FILE")]
     foxglove: Option<PathBuf>,
     /// How often the targets' places are said in the formats of others, a second.
@@ -47,7 +53,12 @@ pub struct OtherFormats {
     rate_hz: f64,
     /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
     /// ellipsoid.
-    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "LAT,LON,HEIGHT",
+        value_parser = numbers::place,
+        allow_hyphen_values = true
+    )]
     anchor: Option<Geodetic>,
     #[command(flatten)]
     formats: FormatArgs,

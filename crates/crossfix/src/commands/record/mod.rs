@@ -37,9 +37,9 @@ const POLL: Duration = Duration::from_millis(50);
 
 /// Record everything that a site publishes.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix record -c configs/site/network.toml -o today.mcap\n  crossfix record -c configs/site/network.toml -o site.mcap --rotate-min 10 --quota-gb 200"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix record -c configs/site/network.toml -o today.mcap\n  \
+    crossfix record -c configs/site/network.toml -o site.mcap --rotate-min 10 --quota-gb 200")]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
@@ -56,8 +56,8 @@ pub struct Args {
     #[command(flatten)]
     video: VideoArgs,
     /// What is written a second time in Foxglove's schemas, so that the files open in Foxglove and
-    /// Rerun without Crossfix: all of cameras, pictures and tracks; the site without pictures, which
-    /// are most of a recording; or none.
+    /// Rerun without Crossfix: all of cameras, pictures and tracks; the site without pictures,
+    /// which are most of a recording; or none.
     #[arg(long, value_enum, default_value_t)]
     foxglove: WithFoxglove,
     #[command(flatten)]

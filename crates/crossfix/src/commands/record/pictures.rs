@@ -30,10 +30,20 @@ pub struct VideoArgs {
     #[arg(long, value_enum, default_value_t)]
     video: Wanted,
     /// With --video tracks: from so long before the track is sure, seconds.
-    #[arg(long, value_name = "SECONDS", default_value_t = 10.0, value_parser = numbers::seconds_of_an_hour)]
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        default_value_t = 10.0,
+        value_parser = numbers::seconds_of_an_hour
+    )]
     video_before_s: f64,
     /// With --video tracks: until so long after it was last seen, seconds.
-    #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = numbers::seconds_of_an_hour)]
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        default_value_t = 5.0,
+        value_parser = numbers::seconds_of_an_hour
+    )]
     video_after_s: f64,
 }
 
