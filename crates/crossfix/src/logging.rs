@@ -1,10 +1,12 @@
 //! Logs go to stderr; results go to stdout.
 
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Stderr};
 
 use clap::{Args, ValueEnum};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::{Directive, LevelFilter};
+use tracing_subscriber::fmt::SubscriberBuilder;
+use tracing_subscriber::fmt::format::{DefaultFields, Format};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 
@@ -56,19 +58,22 @@ pub fn start(args: &LoggingArgs) {
     // is asked for.
     let quiet = Directive::from(LevelFilter::ERROR);
     let filter = filter.add_directive("retina=error".parse().unwrap_or(quiet));
-    let builder = |filter| {
-        tracing_subscriber::fmt()
-            .with_env_filter(filter)
-            .with_ansi(std::io::stderr().is_terminal())
-            .with_writer(std::io::stderr)
-    };
     match (args.log_format, journal()) {
         (LogFormat::Text, Some(journal)) => {
             tracing_subscriber::registry().with(journal).with(filter).init();
         }
-        (LogFormat::Text, None) => builder(filter).with_target(false).init(),
-        (LogFormat::Json, _) => builder(filter).json().init(),
+        (LogFormat::Text, None) => to_stderr(filter).with_target(false).init(),
+        (LogFormat::Json, _) => to_stderr(filter).json().init(),
     }
+}
+
+fn to_stderr(
+    filter: EnvFilter,
+) -> SubscriberBuilder<DefaultFields, Format, EnvFilter, fn() -> Stderr> {
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(std::io::stderr)
 }
 
 /// The system's journal, if stderr goes there: log lines then carry their level and code location

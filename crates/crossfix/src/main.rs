@@ -53,7 +53,13 @@ use crate::commands::Command;
 /// Agents on camera hosts follow small targets and publish bearings; a fusion centre turns the
 /// bearings of three and more cameras into 3D tracks.
 #[derive(Debug, Parser)]
-#[command(name = "crossfix", version, propagate_version = true, after_help = parts::closing_words())]
+#[command(
+    name = "crossfix",
+    version,
+    propagate_version = true,
+    max_term_width = 100,
+    after_help = parts::closing_words()
+)]
 struct Cli {
     #[command(flatten)]
     logging: logging::LoggingArgs,

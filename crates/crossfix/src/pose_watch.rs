@@ -58,6 +58,11 @@ impl CameraWatch {
         self.watched_s = self.watched_s.max(found.watched_s);
         self.now = Some(found);
     }
+
+    /// Whether it was found to be the only one moved, at about that time.
+    fn moved_alone_about(&self, time: Timestamp) -> bool {
+        self.worst.is_moved_alone() && self.worst_at.seconds_since(time).abs() < SAME_KNOCK_S
+    }
 }
 
 impl PoseWatch {
@@ -92,15 +97,9 @@ impl PoseWatch {
     /// Whether a camera has been moved, by all findings. Not if the finding might also have been
     /// due to another camera that at about that time was found to be the only one moved.
     pub fn has_moved(&self, name: &CameraName) -> bool {
-        self.cameras.get(name).is_some_and(|camera| {
-            let took_its_place = |other: &CameraName| {
-                self.cameras.get(other).is_some_and(|other| {
-                    other.worst.is_moved_alone()
-                        && other.worst_at.seconds_since(camera.worst_at).abs() < SAME_KNOCK_S
-                })
-            };
-            camera.worst.is_moved && !camera.worst.or_else.iter().any(took_its_place)
-        })
+        let Some(camera) = self.cameras.get(name) else { return false };
+        let mut others = camera.worst.or_else.iter().filter_map(|other| self.cameras.get(other));
+        camera.worst.is_moved && !others.any(|other| other.moved_alone_about(camera.worst_at))
     }
 
     /// Findings of each camera, by name.

@@ -5,7 +5,7 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 use std::path::Path;
 
-use crossfix_calibration::{CalibratedCamera, SiteCalibration};
+use crossfix_calibration::SiteCalibration;
 use crossfix_message::{
     BearingFrame, CameraCalibration, Channel, Payload, Preview, Timestamp, decode,
 };
@@ -87,10 +87,8 @@ impl Recalibration {
 
     /// Most by which the cameras' times can move apart, s.
     fn spread_s(&self) -> f64 {
-        let ahead = |camera: &CalibratedCamera| {
-            camera.clock.knots_s.iter().map(|knot| knot[1]).collect::<Vec<_>>()
-        };
-        let all: Vec<f64> = self.site.cameras().iter().flat_map(ahead).chain([0.0]).collect();
+        let knots = self.site.cameras().iter().flat_map(|camera| &camera.clock.knots_s);
+        let all: Vec<f64> = knots.map(|knot| knot[1]).chain([0.0]).collect();
         let least = all.iter().copied().fold(f64::INFINITY, f64::min);
         let most = all.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         // Clocks go on at their rate after the last knot.
@@ -127,43 +125,32 @@ impl Reordered {
         }
     }
 
-    /// Takes the recording's next entry; hands on those for which the wait is over.
-    pub fn take(
-        &mut self,
-        entry: Entry,
-        mut handle: impl FnMut(Entry) -> anyhow::Result<()>,
-    ) -> anyhow::Result<()> {
+    /// Takes the recording's next entry; returns those for which the wait is over.
+    pub fn take(&mut self, entry: Entry) -> impl Iterator<Item = Entry> {
         let own = entry.data_time;
         let entry = self.recalibration.applied(entry);
         self.waiting.push(Reverse((entry.data_time, self.next)));
         self.entries.insert(self.next, entry);
         self.next += 1;
-        self.release(own.plus_seconds(-self.spread_s), &mut handle)
+        self.release(own.plus_seconds(-self.spread_s))
     }
 
-    /// Hands on all entries that still wait.
-    pub fn finish(
-        &mut self,
-        mut handle: impl FnMut(Entry) -> anyhow::Result<()>,
-    ) -> anyhow::Result<()> {
+    /// All entries that still wait.
+    pub fn finish(&mut self) -> impl Iterator<Item = Entry> {
         self.recalibration.say();
-        self.release(Timestamp::MAX, &mut handle)
+        self.release(Timestamp::MAX)
     }
 
-    fn release(
-        &mut self,
-        until: Timestamp,
-        handle: &mut impl FnMut(Entry) -> anyhow::Result<()>,
-    ) -> anyhow::Result<()> {
-        while let Some(&Reverse((time, number))) = self.waiting.peek()
-            && time <= until
-        {
-            self.waiting.pop();
-            if let Some(entry) = self.entries.remove(&number) {
-                handle(entry)?;
+    /// The waiting entries up to a time, in order; each is removed when it is asked for.
+    fn release(&mut self, until: Timestamp) -> impl Iterator<Item = Entry> {
+        std::iter::from_fn(move || {
+            let &Reverse((time, number)) = self.waiting.peek()?;
+            if time > until {
+                return None;
             }
-        }
-        Ok(())
+            self.waiting.pop();
+            self.entries.remove(&number)
+        })
     }
 }
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 const PERIOD: Duration = Duration::from_secs(60);
 /// Most kinds that are told apart: the names in them come from outside. With half as many all
 /// beyond 500 share one line, and hide each other.
-const MAX_KINDS: usize = 1000;
+const MOST_KINDS: usize = 1000;
 
 /// Logs the first warning of a kind at once, and after that once a minute how many more there were,
 /// so that whoever can cause a warning cannot fill a disk with it.
@@ -51,7 +51,7 @@ impl Repeats {
     }
 
     fn line(&mut self, kind: &str, now: Instant, text: impl FnOnce() -> String) -> Option<String> {
-        let has_room = self.kinds.len() < MAX_KINDS || self.kinds.contains_key(kind);
+        let has_room = self.kinds.len() < MOST_KINDS || self.kinds.contains_key(kind);
         let kind = if has_room { kind } else { "others" };
         if let Some(known) = self.kinds.get_mut(kind) {
             known.more += 1;
@@ -119,7 +119,7 @@ mod tests {
     fn kinds_are_bounded() {
         let (mut repeats, now) = (Repeats::default(), Instant::now());
         let said = (0..5000).filter_map(|i| repeats.line(&i.to_string(), now, String::new)).count();
-        assert_eq!(said, MAX_KINDS + 1);
+        assert_eq!(said, MOST_KINDS + 1);
         assert_eq!(
             repeats.line("7", now + PERIOD, || "known".to_owned()).as_deref(),
             Some("known (1 times since this was said last)")

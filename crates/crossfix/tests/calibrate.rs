@@ -151,8 +151,8 @@ fn a_wrong_click_is_named_and_nothing_is_written() {
     assert!(!folder.path().join("calibration.toml").exists());
 }
 
-/// The recording has two targets, so nothing is adjusted here: what is wrong of the landmarks is said
-/// before.
+/// The recording has two targets, so nothing is adjusted here: what is wrong of the landmarks is
+/// said before.
 #[test]
 fn landmarks_of_a_flight_are_of_its_cameras_and_in_their_images() {
     let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../../recordings/two-uavs.mcap");

@@ -46,6 +46,60 @@ fn every_command_has_a_purpose_and_an_example() {
     }
 }
 
+/// All commands and their subcommands, each as the arguments that name it.
+fn all_commands() -> Vec<Vec<String>> {
+    let mut all = vec![Vec::new()];
+    let mut next = 0;
+    while next < all.len() {
+        let command = all[next].clone();
+        let children = subcommands(&help_of(&command));
+        all.extend(children.into_iter().map(|child| [command.as_slice(), &[child]].concat()));
+        next += 1;
+    }
+    all
+}
+
+/// The help of a command in a terminal that is wider than the help may be.
+fn help_of(command: &[String]) -> String {
+    let output = crossfix().args(command).arg("--help").env("COLUMNS", "200").output().unwrap();
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn subcommands(help: &str) -> Vec<String> {
+    let list = help.split_once("\nCommands:\n").map_or("", |(_, rest)| rest);
+    let names = list.lines().take_while(|line| !line.is_empty()).filter_map(|line| {
+        // A description that goes on in another line is indented by more than a name.
+        line.strip_prefix("  ").filter(|line| !line.starts_with(' '))?.split(' ').next()
+    });
+    names.filter(|name| *name != "help").map(str::to_owned).collect()
+}
+
+#[test]
+fn no_help_is_wider_than_100_columns() {
+    let commands = all_commands();
+    assert!(commands.len() > COMMANDS.len(), "{commands:?}");
+    for command in commands {
+        for line in help_of(&command).lines() {
+            assert!(line.chars().count() <= 100, "{command:?} --help: {line}");
+        }
+    }
+}
+
+/// An example is copied into a shell: where it goes on in another line, it says so.
+#[test]
+fn a_long_example_is_broken_as_a_shell_needs_it() {
+    for command in all_commands() {
+        let help = help_of(&command);
+        let Some((_, examples)) = help.split_once("\nExample") else { continue };
+        let mut goes_on = false;
+        for line in examples.lines().skip(1).filter(|line| !line.is_empty()) {
+            assert_eq!(goes_on, !line.starts_with("  crossfix "), "{command:?} --help: {line}");
+            goes_on = line.ends_with('\\');
+        }
+        assert!(!goes_on, "{command:?} --help ends with a backslash");
+    }
+}
+
 #[test]
 fn misuse_ends_with_2_and_failure_with_1() {
     crossfix().arg("fly").assert().code(2);
@@ -128,8 +182,8 @@ fn the_site_to_copy_is_good() {
     crossfix().args(["check", "-c", site]).assert().success();
 }
 
-/// A camera of the host that is not there, and one that is no camera, are said with what mends it; its
-/// configuration is held against what cameras can do.
+/// A camera of the host that is not there, and one that is no camera, are said with what mends it;
+/// its configuration is held against what cameras can do.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_camera_of_the_host_is_asked_for_by_its_device() {

@@ -44,8 +44,8 @@ fn write_catalogue(path: &Path, random: &mut ChaCha8Rng) {
     std::fs::write(path, bytes).unwrap();
 }
 
-/// The picture that a camera takes of a sky: stars to magnitude 5 over the noise, in 8 bits, and three lamps
-/// that are no stars.
+/// The picture that a camera takes of a sky: stars to magnitude 5 over the noise, in 8 bits, and
+/// three lamps that are no stars.
 fn write_picture(path: &Path, sky: &Sky, camera: &Camera, random: &mut ChaCha8Rng) {
     let (width, height) = (1280u32, 720u32);
     let mut noise = || -> f64 { StandardNormal.sample(random) };
@@ -76,8 +76,8 @@ fn write_picture(path: &Path, sky: &Sky, camera: &Camera, random: &mut ChaCha8Rn
     encoder.write_header().unwrap().write_image_data(&samples).unwrap();
 }
 
-/// A site with one camera, its picture of the night, and the camera as it really is: its lens 1 % longer than in
-/// its file.
+/// A site with one camera, its picture of the night, and the camera as it really is: its lens 1 %
+/// longer than in its file.
 fn night(seed: u64) -> (tempfile::TempDir, Camera) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folder = tempfile::tempdir().unwrap();
@@ -112,8 +112,8 @@ fn by_stars(folder: &Path, time: &str, others: &[&str]) -> (Option<i32>, String,
     (output.status.code(), text(output.stdout), text(output.stderr))
 }
 
-/// How far beside another a camera points, root mean square over the image, rad: what the rotation and the
-/// principal point make up for in each other is none of it.
+/// How far beside another a camera points, root mean square over the image, rad: what the rotation
+/// and the principal point make up for in each other is none of it.
 fn beside(camera: &Camera, truth: &Camera) -> f64 {
     let pixels = (0..8).flat_map(|x| (0..5).map(move |y| (160 * x + 80, 144 * y + 72)));
     let angle = |(x, y): (i32, i32)| {
@@ -126,8 +126,8 @@ fn beside(camera: &Camera, truth: &Camera) -> f64 {
     (pixels.map(|pixel| angle(pixel).powi(2)).sum::<f64>() / 40.0).sqrt()
 }
 
-/// Each night's rotation and lens are what they really are, as well as it is said: the rotation's squared
-/// error in deviations is 3 in the mean, three times chance's 0.77 over ten nights aside.
+/// Each night's rotation and lens are what they really are, as well as it is said: the rotation's
+/// squared error in deviations is 3 in the mean, three times chance's 0.77 over ten nights aside.
 #[test]
 fn a_night_turns_a_camera_and_tells_its_lens() {
     let mut sum = 0.0;

@@ -15,9 +15,9 @@ use crate::parts;
 /// Videos are opened and held against the intrinsics; of a folder, all files must fit together,
 /// and certificates that are there must be believed.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix check -c configs/site\n  crossfix check -c configs/site/north.toml"
-)]
+#[command(after_help = "Examples:\n  \
+        crossfix check -c configs/site\n  \
+        crossfix check -c configs/site/north.toml")]
 pub struct Args {
     /// A site's folder, or one of its files (TOML): a camera's, the fusion centre's, the network's.
     #[arg(short, long, value_name = "PATH")]

@@ -48,26 +48,32 @@ const SETTLING_S: f64 = 1.5;
 /// Renders what three cameras see of two UAVs, runs an agent a camera, the fusion centre and the
 /// recorder as processes joined by Zenoh on this machine, and holds the tracks against the truth.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix demo --duration 20 --output demo-output\n  crossfix demo --live\n  crossfix demo --hand-off"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix demo --duration 20 --output demo-output\n  \
+    crossfix demo --live\n  \
+    crossfix demo --hand-off")]
 pub struct Args {
     /// Seed of sky and noise.
     #[arg(long, default_value_t = 1, value_name = "N")]
     seed: u64,
     /// How long the scene lasts, seconds.
-    #[arg(long, default_value_t = 25.0, value_name = "SECONDS", value_parser = numbers::demo_seconds,
-          allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 25.0,
+        value_name = "SECONDS",
+        value_parser = numbers::demo_seconds,
+        allow_negative_numbers = true
+    )]
     duration: f64,
     /// The folder to write recording, picture, configurations and logs to.
     #[arg(short, long, default_value = "demo-output", value_name = "DIR")]
     output: PathBuf,
-    /// Let the cameras be network cameras: agents that know nothing of the scene watch their streams
-    /// (RTSP, H.264), are told the cameras' clocks by them, and find the targets.
+    /// Let the cameras be network cameras: agents that know nothing of the scene watch their
+    /// streams (RTSP, H.264), are told the cameras' clocks by them, and find the targets.
     #[arg(long)]
     live: bool,
-    /// Let a fourth camera, with a narrow view on a mount that turns, look for the targets where the
-    /// fusion centre tells it to.
+    /// Let a fourth camera, with a narrow view on a mount that turns, look for the targets where
+    /// the fusion centre tells it to.
     #[arg(long, conflicts_with = "live")]
     hand_off: bool,
     /// Open the live viewer (Rerun), where one is installed.
@@ -239,16 +245,10 @@ fn newest(
 fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
     // All ports are kept open until all are known, so that none is assigned twice.
     let mut held = Vec::new();
-    let mut endpoint = || -> anyhow::Result<String> {
-        let listener = TcpListener::bind("127.0.0.1:0").context("no free port on 127.0.0.1")?;
-        let port = listener.local_addr()?.port();
-        held.push(listener);
-        Ok(format!("tcp/127.0.0.1:{port}"))
-    };
-    let fusion = endpoint()?;
+    let fusion = free_endpoint(&mut held)?;
     let mut cameras = BTreeMap::new();
     for camera in world.cameras() {
-        cameras.insert(camera.name().clone(), endpoint()?);
+        cameras.insert(camera.name().clone(), free_endpoint(&mut held)?);
     }
     Ok(NetworkConfig {
         site: "demo".parse()?,
@@ -263,9 +263,21 @@ fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
     })
 }
 
+/// An endpoint on a free port, which is kept open among those held.
+fn free_endpoint(held: &mut Vec<TcpListener>) -> anyhow::Result<String> {
+    let listener = open_free_port()?;
+    let port = listener.local_addr()?.port();
+    held.push(listener);
+    Ok(format!("tcp/127.0.0.1:{port}"))
+}
+
+fn open_free_port() -> anyhow::Result<TcpListener> {
+    TcpListener::bind("127.0.0.1:0").context("no free port on 127.0.0.1")
+}
+
 /// Network cameras on a port of this machine that is free at present.
 fn free_streams(folder: &Path) -> anyhow::Result<Streams> {
-    let listener = TcpListener::bind("127.0.0.1:0").context("no free port on 127.0.0.1")?;
+    let listener = open_free_port()?;
     Ok(Streams {
         address: listener.local_addr()?,
         scene: folder.join("scene.toml"),
@@ -318,42 +330,46 @@ fn write_files(
         let name = camera.name().clone();
         let lens = camera.camera().model().intrinsics();
         write(&folder.join(format!("{name}.yaml")), &intrinsics_to_yaml(name.as_str(), lens))?;
-        let clock = &camera.description().clock;
-        let file = CameraFile {
-            name: name.clone(),
-            network: "network.toml".into(),
-            calibration: None,
-            intrinsics: Some(format!("{name}.yaml").into()),
-            pose: Some(pose_of(camera)),
-            source: match &files.streams {
-                Some(Streams { address, .. }) => SourceConfig::Stream(StreamConfig::open_to_all(
-                    format!("rtsp://{address}/{name}"),
-                )),
-                None => SourceConfig::Simulation {
-                    scene: "scene.toml".into(),
-                    publish_truth: index == 0,
-                },
-            },
-            clock: ClockConfig {
-                source: files.streams.is_none().then_some(ClockSourceName::Simulated),
-                offset_s: clock.offset_s,
-                drift_ppm: clock.drift_ppm,
-                // For a network camera nobody knows its reporting delay that well, so the default
-                // applies.
-                sd_s: files.streams.is_none().then_some(1e-4),
-            },
-            preview: Default::default(),
-            mount: camera.description().mount.as_ref().map(MountConfig::of),
-            takes_cues: false,
-            boxes: Vec::new(),
-            tracker: TrackerConfig {
-                detector: Some(DetectorConfig::default()),
-                ..TrackerConfig::default()
-            },
+        let source = match &files.streams {
+            Some(Streams { address, .. }) => {
+                SourceConfig::Stream(StreamConfig::open_to_all(format!("rtsp://{address}/{name}")))
+            }
+            None => {
+                SourceConfig::Simulation { scene: "scene.toml".into(), publish_truth: index == 0 }
+            }
         };
         let path = folder.join(format!("{name}.toml"));
-        write(&path, &toml::to_string(&file)?)?;
+        write(&path, &toml::to_string(&camera_file(camera, source))?)?;
         files.cameras.insert(name, path);
     }
     Ok(files)
+}
+
+fn camera_file(camera: &SimulatedCamera, source: SourceConfig) -> CameraFile {
+    let name = camera.name().clone();
+    let clock = &camera.description().clock;
+    // For a network camera nobody knows its reporting delay that well, so the defaults apply.
+    let is_simulated = matches!(source, SourceConfig::Simulation { .. });
+    CameraFile {
+        network: "network.toml".into(),
+        calibration: None,
+        intrinsics: Some(format!("{name}.yaml").into()),
+        pose: Some(pose_of(camera)),
+        source,
+        clock: ClockConfig {
+            source: is_simulated.then_some(ClockSourceName::Simulated),
+            offset_s: clock.offset_s,
+            drift_ppm: clock.drift_ppm,
+            sd_s: is_simulated.then_some(1e-4),
+        },
+        preview: Default::default(),
+        mount: camera.description().mount.as_ref().map(MountConfig::of),
+        takes_cues: false,
+        boxes: Vec::new(),
+        tracker: TrackerConfig {
+            detector: Some(DetectorConfig::default()),
+            ..TrackerConfig::default()
+        },
+        name,
+    }
 }

@@ -26,23 +26,29 @@ const DAY: Duration = Duration::from_secs(24 * 3600);
 
 /// Make or renew a site's certificates, and secure its network by them.
 ///
-/// The first time it makes the site's certificate authority and adds `[security]` to the network file:
-/// from then on every link is encrypted, and each component may say only what is its own.
+/// The first time it makes the site's certificate authority and adds `[security]` to the network
+/// file: from then on every link is encrypted, and each component may say only what is its own.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix enroll -c my-site/network.toml\n  crossfix enroll -c my-site/network.toml --only camera-north\n  crossfix enroll -c my-site/network.toml --revoke camera-north"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix enroll -c my-site/network.toml\n  \
+    crossfix enroll -c my-site/network.toml --only camera-north\n  \
+    crossfix enroll -c my-site/network.toml --revoke camera-north")]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// The folder of the authority, whose key can let anybody in: it stays here. Default: `authority`
-    /// beside the network's file.
+    /// The folder of the authority, whose key can let anybody in: it stays here. Default:
+    /// `authority` beside the network's file.
     #[arg(long, value_name = "FOLDER")]
     authority: Option<PathBuf>,
     /// How long the certificates hold, days. A component says that it is time to renew when a third
     /// is left.
-    #[arg(long, value_name = "DAYS", default_value_t = 90, value_parser = clap::value_parser!(u32).range(1..=3650))]
+    #[arg(
+        long,
+        value_name = "DAYS",
+        default_value_t = 90,
+        value_parser = clap::value_parser!(u32).range(1..=3650)
+    )]
     days: u32,
     /// Only these: camera-NAME, fusion, recorder, router, viewer.
     #[arg(long, value_name = "NAME", conflicts_with = "revoke")]
@@ -50,6 +56,16 @@ pub struct Args {
     /// Believe none of the certificates issued for it so far, and issue another.
     #[arg(long, value_name = "NAME")]
     revoke: Option<Identity>,
+}
+
+impl Args {
+    /// Whether a certificate is to be issued for it.
+    fn means(&self, identity: &Identity) -> bool {
+        match &self.revoke {
+            Some(revoked) => identity == revoked,
+            None => self.only.is_empty() || self.only.contains(identity),
+        }
+    }
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -66,13 +82,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let authority_folder = args.authority.clone().unwrap_or_else(|| folder.join(AUTHORITY));
     let authority = authority(&authority_folder, &security, &before.site)?;
 
-    let is_meant = |identity: &&Identity| match &args.revoke {
-        Some(revoked) => *identity == revoked,
-        None => args.only.is_empty() || args.only.contains(identity),
-    };
     let holds = DAY * args.days;
     let mut rows = vec![["component", "host", "until", "files"].map(str::to_owned).to_vec()];
-    for (identity, hosts) in hosts.iter().filter(|(identity, _)| is_meant(identity)) {
+    for (identity, hosts) in hosts.iter().filter(|(identity, _)| args.means(identity)) {
         let name = security.common_name(identity);
         let issued = authority.issue(&name, hosts, OffsetDateTime::now_utc(), holds)?;
         write(&security, identity, &issued)?;
@@ -204,14 +216,15 @@ fn private_folder(folder: &Path) -> anyhow::Result<()> {
 
 /// Writes a file that only its owner may read.
 fn write_private(path: &Path, text: &str) -> anyhow::Result<()> {
+    try_to_write_private(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn try_to_write_private(path: &Path, text: &str) -> std::io::Result<()> {
     let part = path.with_extension("part");
-    let write = || -> std::io::Result<()> {
-        let _ = fs::remove_file(&part);
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&part)?;
-        file.write_all(text.as_bytes())?;
-        fs::rename(&part, path)
-    };
-    write().with_context(|| format!("cannot write {}", path.display()))
+    let _ = fs::remove_file(&part);
+    let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&part)?;
+    file.write_all(text.as_bytes())?;
+    fs::rename(&part, path)
 }
 
 fn write(security: &Security, identity: &Identity, issued: &Issued) -> anyhow::Result<()> {

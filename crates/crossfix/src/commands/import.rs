@@ -2,15 +2,16 @@ use std::path::{Path, PathBuf};
 
 use crossfix_recording::RecordingWriter;
 
-use crate::import::drone_tracking::{Sample, SplitPart};
+use crate::import::drone_tracking::{RtkSample, SplitPart};
 use crate::import::{drone_tracking, scenario};
 use crate::output::{self, Draft};
 
 /// Turn published data sets into recordings.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap\n  crossfix import scenario DIR -o scenario.mcap"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
+    --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
+    crossfix import scenario DIR -o scenario.mcap")]
 pub struct Args {
     #[command(subcommand)]
     source: Source,
@@ -23,8 +24,13 @@ enum Source {
     /// Data times are RTK seconds from the Unix epoch, or with --raw the seconds that each camera
     /// counts by its frames.
     #[command(
-        after_help = "Examples:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
-                      crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG --part calibration --raw --log-out rtk.csv -o cal.mcap"
+        override_usage = "crossfix import drone-tracking-datasets [OPTIONS] \\\n           \
+            --dataset <N> --cameras <NAMES> --output <FILE> <DIR>",
+        after_help = "Examples:\n  \
+        crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
+        --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
+        crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
+        --cameras gopro3,sony5100,sonyG --part calibration --raw --log-out rtk.csv -o cal.mcap"
     )]
     DroneTrackingDatasets {
         /// The folder with calibration/, poses.json and datasetN/.
@@ -99,9 +105,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 /// Writes positions as a log that `calibrate flight --log` reads.
-fn write_log(path: &Path, samples: &[Sample]) -> anyhow::Result<()> {
+fn write_log(path: &Path, samples: &[RtkSample]) -> anyhow::Result<()> {
     let mut text = String::from("time_s,east_m,north_m,up_m\n");
-    for (time_s, place) in samples {
+    for RtkSample { time_s, place } in samples {
         text += &format!("{time_s:.3},{:.4},{:.4},{:.4}\n", place.x, place.y, place.z);
     }
     output::write_file(path, &[], text.as_bytes())

@@ -173,7 +173,13 @@ pub fn triple(text: &str) -> Result<[f64; 3], String> {
 /// A position on the Earth: degrees of latitude and longitude, metres above the ellipsoid.
 #[cfg(any(feature = "centre", feature = "viewer"))]
 pub fn place(text: &str) -> Result<crossfix_geometry::Geodetic, String> {
-    let [latitude, longitude, height] = triple(text)?;
+    geodetic(triple(text)?)
+}
+
+#[cfg(any(feature = "centre", feature = "viewer"))]
+fn geodetic(
+    [latitude, longitude, height]: [f64; 3],
+) -> Result<crossfix_geometry::Geodetic, String> {
     crossfix_geometry::Geodetic::from_degrees(latitude, longitude, height)
         .map_err(|error| error.to_string())
 }
@@ -185,11 +191,7 @@ pub fn edges(text: &str) -> Result<[crossfix_geometry::Geodetic; 2], String> {
     if south >= north || west >= east {
         return Err("south must be below north, and west below east".to_owned());
     }
-    let corner = |latitude, longitude| {
-        crossfix_geometry::Geodetic::from_degrees(latitude, longitude, 0.0)
-            .map_err(|error| error.to_string())
-    };
-    Ok([corner(south, west)?, corner(north, east)?])
+    Ok([geodetic([south, west, 0.0])?, geodetic([north, east, 0.0])?])
 }
 
 #[cfg(test)]

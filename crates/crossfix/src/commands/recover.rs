@@ -12,8 +12,8 @@ use super::record::foxglove;
 use crate::output::{self, Draft};
 use crate::recorded::Lacks;
 
-/// Make a whole recording of a torn or damaged one: all of Crossfix's that can be read of it, with an
-/// index. What was written is read back before it gets its name.
+/// Make a whole recording of a torn or damaged one: all of Crossfix's that can be read of it, with
+/// an index. What was written is read back before it gets its name.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  crossfix recover torn.mcap -o whole.mcap")]
 pub struct Args {

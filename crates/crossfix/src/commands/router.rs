@@ -18,9 +18,8 @@ const POLL: Duration = Duration::from_millis(200);
 ///
 /// It carries everybody's messages; with `[security]` it holds each component to what it may say.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Example:\n  crossfix router -c configs/site/network.toml --listen tcp/127.0.0.1:7447"
-)]
+#[command(after_help = "Example:\n  \
+        crossfix router -c configs/site/network.toml --listen tcp/127.0.0.1:7447")]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]

@@ -32,22 +32,26 @@ const MOST_TROUBLES: usize = 10;
 
 /// Try a camera: what it sends, how often, and what its clock is worth.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix sources rtsp://10.0.0.5/stream1\n  crossfix sources -c configs/site/north.toml --picture north.jpg\n  crossfix sources\n  crossfix sources /dev/video0 --size 1280x720\n  crossfix sources http://10.0.0.5/onvif/device_service --user eye --password-file password"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix sources rtsp://10.0.0.5/stream1\n  \
+    crossfix sources -c configs/site/north.toml --picture north.jpg\n  \
+    crossfix sources\n  \
+    crossfix sources /dev/video0 --size 1280x720\n  \
+    crossfix sources http://10.0.0.5/onvif/device_service --user eye --password-file password")]
 pub struct Args {
     /// The stream, rtsp://HOST/PATH. One that wants to know who asks is better tried with -c: a
     /// command line can be read by others.
     ///
-    /// Or a camera of this host, /dev/video0, or an industrial one, gige://10.0.0.7. Of a network camera's
-    /// device service (ONVIF), http://HOST/PATH, its streams are listed. Without, those of this host are.
+    /// Or a camera of this host, /dev/video0, or an industrial one, gige://10.0.0.7. Of a network
+    /// camera's device service (ONVIF), http://HOST/PATH, its streams are listed. Without, those of
+    /// this host are.
     #[arg(conflicts_with = "config")]
     url: Option<String>,
     /// A camera's configuration (TOML) whose stream is tried.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// List industrial cameras (GigE Vision), too, and network cameras (ONVIF) where the build has them:
-    /// asks all on this host's networks.
+    /// List industrial cameras (GigE Vision), too, and network cameras (ONVIF) where the build has
+    /// them: asks all on this host's networks.
     #[arg(long, conflicts_with_all = ["url", "config"])]
     lan: bool,
     /// Who asks a network camera, if it is not in the address.
@@ -63,8 +67,13 @@ pub struct Args {
     #[arg(long, value_name = "SIZE", value_parser = size, conflicts_with = "config")]
     size: Option<[u32; 2]>,
     /// How long it is watched, s: cameras say what their clock shows every few seconds.
-    #[arg(long, default_value_t = 8.0, value_name = "SECONDS", value_parser = numbers::seconds_of_a_day,
-          allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 8.0,
+        value_name = "SECONDS",
+        value_parser = numbers::seconds_of_a_day,
+        allow_negative_numbers = true
+    )]
     seconds: f64,
     /// The file to write its last image to (JPEG).
     #[arg(long, value_name = "FILE")]

@@ -115,20 +115,21 @@ fn apply(table: &mut toml::Table, set: &str) -> anyhow::Result<()> {
 /// A parser's message, which shows the faulty line, without credentials: without all between `//`
 /// and `@`, and without what is given as a password.
 fn without_passwords(message: &str) -> String {
-    let of_line = |line: &str| {
-        let mut line = line.to_owned();
-        if let Some(begin) = line.find("//").map(|at| at + 2)
-            && let Some(end) = line.rfind('@').filter(|end| *end > begin)
-        {
-            line.replace_range(begin..end, "...");
-        }
-        let password = line.find("password").filter(|_| !line.contains("password_file"));
-        if let Some(begin) = password.and_then(|at| Some(at + line[at..].find('=')? + 1)) {
-            line.replace_range(begin.., " ...");
-        }
-        line
-    };
-    message.lines().map(of_line).collect::<Vec<_>>().join("\n")
+    message.lines().map(line_without_passwords).collect::<Vec<_>>().join("\n")
+}
+
+fn line_without_passwords(line: &str) -> String {
+    let mut line = line.to_owned();
+    if let Some(begin) = line.find("//").map(|at| at + 2)
+        && let Some(end) = line.rfind('@').filter(|end| *end > begin)
+    {
+        line.replace_range(begin..end, "...");
+    }
+    let password = line.find("password").filter(|_| !line.contains("password_file"));
+    if let Some(begin) = password.and_then(|at| Some(at + line[at..].find('=')? + 1)) {
+        line.replace_range(begin.., " ...");
+    }
+    line
 }
 
 /// The parser's message; if it names an unknown key, with the nearest known one.

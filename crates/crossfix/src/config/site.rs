@@ -44,14 +44,13 @@ fn toml_files(folder: &Path) -> anyhow::Result<Vec<(PathBuf, toml::Table)>> {
         }
     }
     files.sort();
-    let read = |path: PathBuf| {
-        let text = std::fs::read_to_string(&path)
-            .with_context(|| format!("cannot read {}", path.display()))?;
-        let keys =
-            super::parse(&text, &[]).with_context(|| format!("{} is no TOML", path.display()))?;
-        Ok((path, keys))
-    };
-    files.into_iter().map(read).collect()
+    files.into_iter().map(|path| read_keys(&path).map(|keys| (path, keys))).collect()
+}
+
+fn read_keys(path: &Path) -> anyhow::Result<toml::Table> {
+    let text =
+        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    super::parse(&text, &[]).with_context(|| format!("{} is no TOML", path.display()))
 }
 
 fn is_camera(keys: &toml::Table) -> bool {
@@ -61,11 +60,9 @@ fn is_camera(keys: &toml::Table) -> bool {
 /// The camera files of a folder, whether or not the rest of the site exists yet.
 pub fn load_cameras(folder: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>> {
     let files = toml_files(folder)?.into_iter().filter(|(_, keys)| is_camera(keys));
-    let load = |(path, _): (PathBuf, toml::Table)| {
-        let file = CameraFile::load(&path, &[])?;
-        Ok((path, file))
-    };
-    let cameras = files.map(load).collect::<anyhow::Result<Vec<_>>>()?;
+    let cameras = files
+        .map(|(path, _)| CameraFile::load(&path, &[]).map(|file| (path, file)))
+        .collect::<anyhow::Result<Vec<_>>>()?;
     ensure!(!cameras.is_empty(), "{} holds no camera file", folder.display());
     Ok(cameras)
 }
@@ -147,13 +144,9 @@ impl SiteFolder {
         let entries = std::fs::read_dir(&security.certificates).into_iter().flatten().flatten();
         let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
         let identities = names.filter_map(|name| name.strip_suffix(".pem")?.parse().ok());
-        // The certificate of a camera that has been removed since does no harm.
-        let is_known = |identity: &Identity| match identity {
-            Identity::Camera(camera) => network.cameras.contains_key(camera),
-            _ => true,
-        };
         let now = SystemTime::now();
-        for identity in identities.filter(is_known) {
+        // The certificate of a camera that has been removed since does no harm.
+        for identity in identities.filter(|identity| !is_removed(identity, network)) {
             let credentials = Credentials::load(security, &identity, now)
                 .with_context(|| format!("the certificate of {identity}"))?;
             let left = credentials.not_after().duration_since(now).unwrap_or_default();
@@ -181,6 +174,11 @@ impl SiteFolder {
         );
         Ok(())
     }
+}
+
+/// Whether it is of a camera that the network does not have.
+fn is_removed(identity: &Identity, network: &NetworkConfig) -> bool {
+    matches!(identity, Identity::Camera(camera) if !network.cameras.contains_key(camera))
 }
 
 /// Checks a fusion centre's file, and that the network knows its cameras.

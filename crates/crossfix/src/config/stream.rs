@@ -164,18 +164,20 @@ fn is_secret(word: &str) -> bool {
     name.ends_with('=') && SECRETS.iter().any(|secret| name.contains(secret))
 }
 
+/// Whether a word of a pipeline may give a password away: a secret property, or an address with a
+/// user or a query.
+fn may_hold_password(word: &str) -> bool {
+    let host = word.split_once("://").map(|(_, rest)| rest.split('/').next().unwrap_or(rest));
+    is_secret(word)
+        || word.contains("://") && word.contains('?')
+        || host.is_some_and(|host| host.contains('@'))
+}
+
 impl GstreamerConfig {
     pub(super) fn check(&self) -> anyhow::Result<()> {
         ensure!(!self.pipeline.trim().is_empty(), "key `source.pipeline` is empty");
-        let names_somebody = |word: &str| {
-            let host =
-                word.split_once("://").map(|(_, rest)| rest.split('/').next().unwrap_or(rest));
-            is_secret(word)
-                || word.contains("://") && word.contains('?')
-                || host.is_some_and(|host| host.contains('@'))
-        };
         ensure!(
-            !self.pipeline.split_whitespace().any(names_somebody),
+            !self.pipeline.split_whitespace().any(may_hold_password),
             "key `source.pipeline` holds a password, and is shown in logs: give `source.user` and \
              `source.password_file`, and name=camera to the element that asks"
         );

@@ -55,7 +55,7 @@ pub enum SplitPart {
 pub struct ImportedFlight {
     pub entries: Vec<Entry>,
     /// The drone's positions by RTK, errors included.
-    pub log: Vec<Sample>,
+    pub log: Vec<RtkSample>,
 }
 
 /// Standard deviation of a raw label, pixels, as found for these cameras. It is only stated where
@@ -206,7 +206,7 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<ImportedFli
     let folder = dir.join(format!("dataset{}", selection.dataset));
     let is_wanted = |rtk_seconds: f64| selection.part.holds(&split, rtk_seconds);
     let rtk = rtk_samples(&folder.join("trajectory").join("rtk.txt"))?;
-    let log = rtk.iter().map(|(_, sample)| *sample).filter(|sample| is_wanted(sample.0)).collect();
+    let log = rtk.iter().copied().filter(|sample| is_wanted(sample.time_s)).collect();
     let mut entries = truth(&rtk, &masked, &site, is_wanted);
     for wanted in selection.cameras {
         let found = split.cameras.iter().find(|(_, camera)| camera.name == *wanted);
@@ -394,25 +394,26 @@ fn bearing_track(
 
 /// The truth of the wanted RTK seconds, without the masked samples.
 fn truth(
-    rtk: &[(usize, Sample)],
+    rtk: &[RtkSample],
     masked: &[f64],
     site: &SiteName,
     is_wanted: impl Fn(f64) -> bool,
 ) -> Vec<Entry> {
     let key = Key::new(site.clone(), Channel::Truth);
-    let good: Vec<Sample> = rtk
+    let good: Vec<RtkSample> = rtk
         .iter()
-        .filter(|(index, _)| !masked.contains(&(*index as f64)))
+        .enumerate()
+        .filter(|(row, _)| !masked.contains(&(*row as f64)))
         .map(|(_, sample)| *sample)
         .collect();
     let mut entries = Vec::new();
     for window in good.windows(3) {
-        let (seconds, place) = window[1];
-        if !is_wanted(seconds) {
+        let RtkSample { time_s, place } = window[1];
+        if !is_wanted(time_s) {
             continue;
         }
         let velocity = Some(velocity_between(&window[0], &window[1], &window[2]).into());
-        let time = Timestamp::from_seconds(seconds);
+        let time = Timestamp::from_seconds(time_s);
         let state = TrueState { id: 1, position: Some(place.into()), velocity };
         let frame =
             TruthFrame { time_ns: time.nanos(), targets: vec![state], ..Default::default() };
@@ -421,11 +422,15 @@ fn truth(
     entries
 }
 
-/// A time (s) and the drone's position then.
-pub type Sample = (f64, Point3<f64>);
+/// A time and the drone's position then.
+#[derive(Clone, Copy, Debug)]
+pub struct RtkSample {
+    pub time_s: f64,
+    pub place: Point3<f64>,
+}
 
-/// The RTK samples with their row numbers, in order of time.
-fn rtk_samples(path: &Path) -> anyhow::Result<Vec<(usize, Sample)>> {
+/// The RTK samples, one of each row, in order of time.
+fn rtk_samples(path: &Path) -> anyhow::Result<Vec<RtkSample>> {
     let text = read_text(path)?;
     let rows = text
         .lines()
@@ -433,22 +438,24 @@ fn rtk_samples(path: &Path) -> anyhow::Result<Vec<(usize, Sample)>> {
             line.split_whitespace().map_while(|word| word.parse().ok()).collect::<Vec<f64>>()
         })
         .filter(|row| row.len() >= 3);
-    let sample = |(k, row): (usize, Vec<f64>)| {
+    let places = rows.map(|row| {
         // Rows of four columns begin with an index.
         let offset = usize::from(row.len() > 3);
-        let place = Point3::new(row[offset], row[offset + 1], row[offset + 2]);
-        (k, (k as f64 / RTK_RATE, place))
-    };
-    Ok(rows.enumerate().map(sample).collect())
+        Point3::new(row[offset], row[offset + 1], row[offset + 2])
+    });
+    let samples =
+        places.enumerate().map(|(row, place)| RtkSample { time_s: row as f64 / RTK_RATE, place });
+    Ok(samples.collect())
 }
 
 /// Velocity at the second of three samples: that of the parabola through them. With equal spacing
 /// this is the difference of the outer two over the time between them.
-fn velocity_between(before: &Sample, at: &Sample, after: &Sample) -> Vector3<f64> {
-    let (back, on) = (at.0 - before.0, after.0 - at.0);
-    let (came, goes) = ((at.1 - before.1) / back, (after.1 - at.1) / on);
+fn velocity_between(before: &RtkSample, at: &RtkSample, after: &RtkSample) -> Vector3<f64> {
+    let (back_s, on_s) = (at.time_s - before.time_s, after.time_s - at.time_s);
+    let came = (at.place - before.place) / back_s;
+    let goes = (after.place - at.place) / on_s;
     // v = (v_before dt_after + v_after dt_before) / (dt_before + dt_after)
-    (came * on + goes * back) / (back + on)
+    (came * on_s + goes * back_s) / (back_s + on_s)
 }
 
 #[cfg(test)]

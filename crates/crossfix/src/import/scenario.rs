@@ -141,9 +141,9 @@ fn truth(dir: &Path, site: &SiteName, scenario: &Scenario) -> anyhow::Result<Vec
         }
     }
     let key = Key::new(site.clone(), Channel::Truth);
-    let entry = |(time, targets): (Timestamp, Vec<TrueState>)| {
+    let entries = frames.into_iter().map(|(time, targets)| {
         let frame = TruthFrame { time_ns: time.nanos(), targets, ..Default::default() };
         imported(key.clone(), time, frame.encode())
-    };
-    Ok(frames.into_iter().map(entry).collect())
+    });
+    Ok(entries.collect())
 }

@@ -126,13 +126,15 @@ impl Head {
         }
     }
 
+    /// Whether reported angles are the same as others but for the reports' errors.
+    fn is_at(&self, reported: ScanAngles, there: ScanAngles) -> bool {
+        (reported.azimuth - there.azimuth).abs() <= self.same_rad
+            && (reported.elevation - there.elevation).abs() <= self.same_rad
+    }
+
     /// Takes in a report of where the mount is, and whether it moves.
     fn hear(&mut self, angles: ScanAngles, moves: bool, now: Instant) {
-        let same = |other: ScanAngles| {
-            (angles.azimuth - other.azimuth).abs() <= self.same_rad
-                && (angles.elevation - other.elevation).abs() <= self.same_rad
-        };
-        let stays = !moves && self.still.is_some_and(|(there, _)| same(there));
+        let stays = !moves && self.still.is_some_and(|(there, _)| self.is_at(angles, there));
         if !stays {
             self.still = (!moves).then_some((angles, now));
         }
@@ -141,7 +143,7 @@ impl Head {
         if !stays {
             // It may stop short of its goal: the wait begins again where it stops.
             self.order = Some(Order { to, sent: Some(now) });
-        } else if same(to) || now.duration_since(sent) > BEGINS_WITHIN {
+        } else if self.is_at(angles, to) || now.duration_since(sent) > BEGINS_WITHIN {
             self.order = None;
         }
     }

@@ -46,12 +46,14 @@ impl State {
     /// Pan and tilt now, and whether they change.
     pub fn position(&self) -> ([f64; 2], bool) {
         let passed = self.told.elapsed().saturating_sub(BEGINS_AFTER).as_secs_f64();
-        let turned = |k: usize| {
-            let way = self.to[k] - self.from[k];
-            self.from[k] + way.clamp(-RATE * passed, RATE * passed)
-        };
-        let now = [turned(0), turned(1)];
+        let now = [0, 1].map(|axis| self.turned(axis, passed));
         (now, now != self.to && passed > 0.0)
+    }
+
+    /// Where an axis is after it has turned for a time, s.
+    fn turned(&self, axis: usize, passed_s: f64) -> f64 {
+        let way = self.to[axis] - self.from[axis];
+        self.from[axis] + way.clamp(-RATE * passed_s, RATE * passed_s)
     }
 }
 
@@ -159,16 +161,18 @@ fn attribute(text: &str, element: &str, name: &str) -> Option<f64> {
 
 /// Whether the request proves knowledge of the password (WS-Security, `PasswordDigest`).
 fn knows_password(request: &str) -> bool {
-    let proof = || {
-        let nonce = STANDARD.decode(element(request, "Nonce")?).ok()?;
-        let mut digest = Sha1::new();
-        digest.update(&nonce);
-        digest.update(element(request, "Created")?);
-        digest.update(PASSWORD);
-        let proved = STANDARD.encode(digest.finalize()) == element(request, "Password")?;
-        Some(proved && element(request, "Username")? == USER)
-    };
-    proof().unwrap_or(false)
+    is_proof_of_password(request).unwrap_or(false)
+}
+
+/// Whether the request's proof is right; `None` if it holds none.
+fn is_proof_of_password(request: &str) -> Option<bool> {
+    let nonce = STANDARD.decode(element(request, "Nonce")?).ok()?;
+    let mut digest = Sha1::new();
+    digest.update(&nonce);
+    digest.update(element(request, "Created")?);
+    digest.update(PASSWORD);
+    let proved = STANDARD.encode(digest.finalize()) == element(request, "Password")?;
+    Some(proved && element(request, "Username")? == USER)
 }
 
 fn fault(reason: &str) -> String {

@@ -2,7 +2,7 @@
 
 use crossfix_calibration::{FlightResult, Survey};
 use crossfix_message::CameraName;
-use nalgebra::Vector3;
+use nalgebra::{Point3, Vector3};
 use serde::Serialize;
 
 use crate::output;
@@ -39,12 +39,8 @@ struct BesideDistance {
 impl BesideSurvey {
     /// Compares the cameras that a flight has placed with a survey.
     pub fn of(result: &FlightResult, survey: &Survey) -> Self {
-        let centre = |name: &CameraName| {
-            let found = result.cameras.iter().find(|camera| camera.name == *name)?;
-            Some(found.camera.pose().position())
-        };
         let places = survey.places.iter().filter_map(|place| {
-            let beside = centre(&place.camera)? - place.position;
+            let beside = centre(result, &place.camera)? - place.position;
             let deviations = beside.component_div(&place.sd_m).amax();
             Some(BesidePlace {
                 camera: place.camera.to_string(),
@@ -54,7 +50,7 @@ impl BesideSurvey {
         });
         let distances = survey.distances.iter().filter_map(|taped| {
             let [first, second] = &taped.between;
-            let longer_m = (centre(second)? - centre(first)?).norm() - taped.metres;
+            let longer_m = (centre(result, second)? - centre(result, first)?).norm() - taped.metres;
             Some(BesideDistance {
                 between: taped.between.each_ref().map(ToString::to_string),
                 longer_m,
@@ -123,6 +119,12 @@ impl BesideSurvey {
         ));
         (rows.len() > 1).then(|| output::table(&rows))
     }
+}
+
+/// Where the flight has a camera, if it has placed it.
+fn centre(result: &FlightResult, name: &CameraName) -> Option<Point3<f64>> {
+    let found = result.cameras.iter().find(|camera| camera.name == *name)?;
+    Some(found.camera.pose().position())
 }
 
 #[cfg(test)]

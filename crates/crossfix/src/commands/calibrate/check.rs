@@ -26,14 +26,14 @@ const LEAST_WATCHED_S: f64 = 20.0;
 /// A camera that has been turned by two milliradians is named after a minute of targets that it and
 /// two others see. The exit code is 1 if one does not fit.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix calibrate check last-night.mcap\n  crossfix calibrate check raw.mcap -c my-site"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix calibrate check last-night.mcap\n  \
+    crossfix calibrate check raw.mcap -c my-site")]
 pub struct Args {
     /// A recording (MCAP) of targets that several cameras see.
     recording: PathBuf,
-    /// The calibration, or the site's folder with `calibration.toml` in it, in the place of what was
-    /// recorded: of a recording that was made without one.
+    /// The calibration, or the site's folder with `calibration.toml` in it, in the place of what
+    /// was recorded: of a recording that was made without one.
     #[arg(short, long, value_name = "PATH")]
     config: Option<PathBuf>,
     /// Print JSON.
@@ -153,46 +153,58 @@ fn watched(
     recalibration: Option<Recalibration>,
     fusion: Option<&Path>,
 ) -> anyhow::Result<BTreeMap<CameraName, CameraRecord>> {
-    let mut centre = Centre::new(FusionFile::load(fusion, &[])?.fusion(), None)?;
+    let centre = Centre::new(FusionFile::load(fusion, &[])?.fusion(), None)?;
+    let mut run = WatchedRun { centre, cameras: BTreeMap::new() };
     for entry in calibrations(recording, recalibration.is_some())? {
         let entry =
             recalibration.as_ref().map_or_else(|| entry.clone(), |new| new.applied(entry.clone()));
-        centre.take(&entry.key.channel, &entry.data, "");
+        run.centre.take(&entry.key.channel, &entry.data, "");
     }
-    let mut seen: BTreeMap<CameraName, CameraRecord> = BTreeMap::new();
-    let mut take = |entry: Entry| {
-        match &entry.key.channel {
-            Channel::Bearings(name) => {
-                seen.entry(name.clone()).or_default().see_frame(entry.data_time);
-            }
-            // A camera that never saw anything gets an entry, too.
-            Channel::Calibration(name) => drop(seen.entry(name.clone()).or_default()),
-            _ => {}
-        }
-        for output in centre.take(&entry.key.channel, &entry.data, "") {
-            if let Output::Camera(name, standing) = output {
-                seen.entry(name).or_default().note(standing, centre.now());
-            }
-        }
-        Ok(())
-    };
     let mut lacks = Lacks::default();
     let mut reordered = recalibration.map(Reordered::new);
-    recorded::for_each(recording, &mut lacks, |_, entry| match &mut reordered {
-        Some(reordered) => reordered.take(entry, &mut take),
-        None => take(entry),
+    recorded::for_each(recording, &mut lacks, |_, entry| {
+        match &mut reordered {
+            Some(reordered) => reordered.take(entry).for_each(|entry| run.take(&entry)),
+            None => run.take(&entry),
+        }
+        Ok(())
     })?;
     if let Some(reordered) = &mut reordered {
-        reordered.finish(&mut take)?;
+        reordered.finish().for_each(|entry| run.take(&entry));
     }
+    let WatchedRun { mut centre, mut cameras } = run;
     centre.flush();
     lacks.say(recording);
-    lacks.ensure_found(seen.values().any(|seen| seen.frames > 0), "bearings", recording)?;
-    for (name, seen) in &mut seen {
+    lacks.ensure_found(cameras.values().any(|seen| seen.frames > 0), "bearings", recording)?;
+    for (name, seen) in &mut cameras {
         seen.watch = centre.poses().cameras().get(name).cloned();
         seen.has_moved = centre.poses().has_moved(name);
     }
-    Ok(seen)
+    Ok(cameras)
+}
+
+/// State of the fusion, and what has become of each camera.
+struct WatchedRun {
+    centre: Centre,
+    cameras: BTreeMap<CameraName, CameraRecord>,
+}
+
+impl WatchedRun {
+    fn take(&mut self, entry: &Entry) {
+        match &entry.key.channel {
+            Channel::Bearings(name) => {
+                self.cameras.entry(name.clone()).or_default().see_frame(entry.data_time);
+            }
+            // A camera that never saw anything gets an entry, too.
+            Channel::Calibration(name) => drop(self.cameras.entry(name.clone()).or_default()),
+            _ => {}
+        }
+        for output in self.centre.take(&entry.key.channel, &entry.data, "") {
+            if let Output::Camera(name, standing) = output {
+                self.cameras.entry(name).or_default().note(standing, self.centre.now());
+            }
+        }
+    }
 }
 
 /// Verdict on a camera.

@@ -14,12 +14,11 @@ use crate::output;
 
 /// How far two calibrations of one site lie apart.
 ///
-/// What all cameras are off by alike (a log that lay beside) is said apart; the cameras are compared
-/// beside it, over their images.
+/// What all cameras are off by alike (a log that lay beside) is said apart; the cameras are
+/// compared beside it, over their images.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Example:\n  crossfix calibrate compare my-site/calibration.toml my-site/calibration-today.toml"
-)]
+#[command(after_help = "Example:\n  \
+    crossfix calibrate compare my-site/calibration.toml my-site/calibration-today.toml")]
 pub struct Args {
     /// A calibration (TOML).
     first: PathBuf,

@@ -3,8 +3,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_calibration::{
-    CalibratedCamera, CameraLabels, FlightResult, Label, LensFreedom, SiteCalibration,
-    SurveyedLandmark, calibrate_flight,
+    CalibratedCamera, CameraLabels, FlightLog, FlightResult, Label, LensFreedom, SiteCalibration,
+    Survey, SurveyedLandmark, calibrate_flight,
 };
 use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
 use crossfix_message::{
@@ -24,22 +24,34 @@ use crate::commands::numbers;
 use crate::output::{self, Draft};
 use crate::recorded::{self, Lacks};
 
-/// From the flight of one target: with the log of its own receiver, with where cameras stand, or with
-/// landmarks in their pictures.
+/// From the flight of one target: with the log of its own receiver, with where cameras stand, or
+/// with landmarks in their pictures.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml\n  crossfix calibrate flight REC.mcap --positions survey.csv -o my-site/calibration.toml\n  crossfix calibrate flight REC.mcap --landmarks points.csv -o my-site/calibration.toml"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk \
+    -o my-site/calibration.toml\n  \
+    crossfix calibrate flight REC.mcap --positions survey.csv -o my-site/calibration.toml\n  \
+    crossfix calibrate flight REC.mcap --landmarks points.csv -o my-site/calibration.toml")]
 pub struct Args {
     /// The recording (MCAP) of what the cameras saw.
     recording: PathBuf,
     /// Where the target was by its own receiver: a CSV with time_s and east_m, north_m, up_m, or
     /// latitude_deg, longitude_deg, height_m; or GPX; or NMEA.
-    #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance", "landmarks", "prior"])]
+    #[arg(
+        long,
+        value_name = "FILE",
+        required_unless_present_any = ["positions", "distance", "landmarks", "prior"]
+    )]
     log: Option<PathBuf>,
-    /// Where the site's origin is (WGS84 degrees, and metres above the ellipsoid; above which the drone took
-    /// off with --height takeoff), for a log or landmarks in degrees; the log's first place without.
-    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    /// Where the site's origin is (WGS84 degrees, and metres above the ellipsoid; above which the
+    /// drone took off with --height takeoff), for a log or landmarks in degrees; the log's first
+    /// place without.
+    #[arg(
+        long,
+        value_name = "LAT,LON,HEIGHT",
+        value_parser = numbers::place,
+        allow_hyphen_values = true
+    )]
     anchor: Option<Geodetic>,
     /// What the log's times are: as in the file, or GPS's, which are 18 s ahead of UTC.
     #[arg(long, default_value = "file", value_enum, value_name = "TIME")]
@@ -47,12 +59,23 @@ pub struct Args {
     /// What the log's heights count from, where they are beside degrees.
     #[arg(long, default_value = "ellipsoid", value_enum, value_name = "FROM")]
     height: LogHeight,
-    /// How far the sea is above the WGS84 ellipsoid there, m, where the log does not say (with --height
-    /// sea).
-    #[arg(long, value_name = "METRES", value_parser = numbers::height_difference, allow_hyphen_values = true)]
+    /// How far the sea is above the WGS84 ellipsoid there, m, where the log does not say (with
+    /// --height sea).
+    #[arg(
+        long,
+        value_name = "METRES",
+        value_parser = numbers::height_difference,
+        allow_hyphen_values = true
+    )]
     geoid: Option<f64>,
     /// How far the receiver is above what cameras see as the target's middle, m.
-    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::height_difference, allow_hyphen_values = true)]
+    #[arg(
+        long,
+        default_value_t = 0.0,
+        value_name = "METRES",
+        value_parser = numbers::height_difference,
+        allow_hyphen_values = true
+    )]
     antenna: f64,
     /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two say how large the
     /// site is, three where it is; without a log the flight may be anybody's.
@@ -62,13 +85,18 @@ pub struct Args {
     #[arg(long, value_name = "A,B,METRES")]
     distance: Vec<Distance>,
     /// What was clicked in the cameras' pictures: a CSV with camera, landmark, x_px, y_px, east_m,
-    /// north_m, up_m, sd_m; or latitude_deg, longitude_deg, height_m; or azimuth_deg, elevation_deg of
-    /// the sun and stars. Of the same name is the same thing.
+    /// north_m, up_m, sd_m; or latitude_deg, longitude_deg, height_m; or azimuth_deg, elevation_deg
+    /// of the sun and stars. Of the same name is the same thing.
     #[arg(long, value_name = "FILE")]
     landmarks: Option<PathBuf>,
-    /// An earlier calibration (TOML) of the site: what it says of poses and lenses counts as what is known. The flight may be anybody's; the difference is printed. Where the site is
-    /// as a whole stays what it says.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["log", "positions", "distance", "landmarks", "lens"])]
+    /// An earlier calibration (TOML) of the site: what it says of poses and lenses counts as what
+    /// is known. The flight may be anybody's; the difference is printed. Where the site is as a
+    /// whole stays what it says.
+    #[arg(
+        long,
+        value_name = "FILE",
+        conflicts_with_all = ["log", "positions", "distance", "landmarks", "lens"]
+    )]
     prior: Option<PathBuf>,
     /// How good the log is.
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
@@ -133,12 +161,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let worth = held_out
         .map(|part| part.fused(&args.recording, SiteCalibration::from(&believed), log.as_ref()))
         .transpose()?;
-    let calibrated: Vec<&CameraName> = result.cameras.iter().map(|camera| &camera.name).collect();
-    let rests = if log.is_none() || survey.tells_size(&calibrated) {
-        Rests::OnSurvey
-    } else {
-        Rests::OnLogAlone
-    };
+    let rests = rests(&result, log.as_ref(), &survey);
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
@@ -166,6 +189,16 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     take_out_wrong(&mut result)?;
     args.write(&result)?;
     drawn
+}
+
+/// What determines the size and position of the calibrated site.
+fn rests(result: &FlightResult, log: Option<&FlightLog>, survey: &Survey) -> Rests {
+    let calibrated: Vec<&CameraName> = result.cameras.iter().map(|camera| &camera.name).collect();
+    if log.is_none() || survey.tells_size(&calibrated) {
+        Rests::OnSurvey
+    } else {
+        Rests::OnLogAlone
+    }
 }
 
 /// Removes wrong cameras from a calibration, and refuses one that is wrong as a whole.
@@ -420,11 +453,13 @@ fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, RecordedCa
 
 /// The targets that a frame measured, with its time by the camera's own clock.
 fn measured(frame: &BearingFrame, time_s: f64) -> impl Iterator<Item = Label> + '_ {
-    let is_measured = |track: &&BearingTrack| {
-        track.state() == ImageTrackState::Tracking
-            && track.pixel_x.is_finite()
-            && track.pixel_y.is_finite()
-    };
+    let measured = frame.tracks.iter().filter(|track| is_measured(track));
     let pixel = |track: &BearingTrack| Pixel::new(track.pixel_x, track.pixel_y);
-    frame.tracks.iter().filter(is_measured).map(move |track| Label { time_s, pixel: pixel(track) })
+    measured.map(move |track| Label { time_s, pixel: pixel(track) })
+}
+
+fn is_measured(track: &BearingTrack) -> bool {
+    track.state() == ImageTrackState::Tracking
+        && track.pixel_x.is_finite()
+        && track.pixel_y.is_finite()
 }

@@ -119,19 +119,15 @@ impl HeldOut {
             run.take(&recalibration.applied(entry));
         }
         let mut reordered = Reordered::new(recalibration);
-        let mut take = |entry: Entry| {
-            run.take(&entry);
-            Ok(())
-        };
         recorded::for_each(recording, &mut lacks, |_, entry| {
             let is_known =
                 matches!(&entry.key.channel, Channel::Bearings(name) if known.contains(name));
             if is_known && self.has(&entry) {
-                reordered.take(entry, &mut take)?;
+                reordered.take(entry).for_each(|entry| run.take(&entry));
             }
             Ok(())
         })?;
-        reordered.finish(&mut take)?;
+        reordered.finish().for_each(|entry| run.take(&entry));
         let outputs = run.centre.flush();
         run.note(outputs);
         Ok(run.worth(log))

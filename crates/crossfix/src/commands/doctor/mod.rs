@@ -39,12 +39,12 @@ const LATEST_S: f64 = 0.5;
 
 /// Find out what keeps a camera host or a site from working, and how to mend it.
 ///
-/// Of a camera's file: the camera and what it sends, its clock and this host's, the decoder, the port.
-/// Of the network's or the fusion centre's: who can be reached.
+/// Of a camera's file: the camera and what it sends, its clock and this host's, the decoder, the
+/// port. Of the network's or the fusion centre's: who can be reached.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix doctor -c configs/site/north.toml\n  crossfix doctor -c configs/site/network.toml"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix doctor -c configs/site/north.toml\n  \
+    crossfix doctor -c configs/site/network.toml")]
 pub struct Args {
     /// A file of the site (TOML): a camera's, the fusion centre's, the network's.
     #[arg(short, long, value_name = "FILE")]

@@ -4,6 +4,10 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 use crossfix_evaluation::Report;
+#[cfg(feature = "viewer")]
+use crossfix_message::Timestamp;
+#[cfg(feature = "viewer")]
+use crossfix_view::PlaceInTime;
 use serde::Serialize;
 
 use super::{EvaluatedRun, Evaluation, Question, evaluate};
@@ -78,8 +82,7 @@ pub fn render(comparison: &Comparison, names: [&Path; 2]) -> String {
 /// Draws both runs and the truth beside each other for Rerun.
 #[cfg(feature = "viewer")]
 pub fn draw(a: &Path, b: &Path, question: &Question, path: &Path) -> anyhow::Result<()> {
-    use crossfix_message::Timestamp;
-    use crossfix_view::{ComparedRun, ComparisonPicture, PlaceInTime};
+    use crossfix_view::{ComparedRun, ComparisonPicture};
 
     let (mut first, mut second) = (EvaluatedRun::default(), EvaluatedRun::default());
     first.read(a, question.smoothed)?;
@@ -106,22 +109,22 @@ pub fn draw(a: &Path, b: &Path, question: &Question, path: &Path) -> anyhow::Res
     places.sort_by_key(|at| (at.time, at.id));
     let mut times: Vec<Timestamp> = places.iter().map(|at| at.time).collect();
     times.dedup();
-    let compared = |run: &EvaluatedRun, path: &Path| {
-        let at = |&time: &Timestamp| {
-            run.estimates(time, 0.0).into_iter().map(move |estimate| PlaceInTime {
-                time,
-                id: estimate.id,
-                place: estimate.state.position(),
-            })
-        };
-        ComparedRun {
-            name: path.display().to_string(),
-            tracks: times.iter().flat_map(at).collect(),
-        }
-    };
-    let runs = vec![compared(&first, a), compared(&second, b)];
-    let picture = ComparisonPicture { truth: places, runs };
+    let drawn = [(a, &first), (b, &second)].map(|(path, run)| ComparedRun {
+        name: path.display().to_string(),
+        tracks: times.iter().flat_map(|time| tracks_at(run, *time)).collect(),
+    });
+    let picture = ComparisonPicture { truth: places, runs: drawn.into() };
     let draft = output::Draft::new(path, &[a, b])?;
     picture.draw(&crossfix_view::save(draft.path())?).context("the picture is not complete")?;
     draft.keep()
+}
+
+/// Where a run has tracks at a time.
+#[cfg(feature = "viewer")]
+fn tracks_at(run: &EvaluatedRun, time: Timestamp) -> impl Iterator<Item = PlaceInTime> {
+    run.estimates(time, 0.0).into_iter().map(move |estimate| PlaceInTime {
+        time,
+        id: estimate.id,
+        place: estimate.state.position(),
+    })
 }

@@ -8,7 +8,7 @@ use crossfix_evaluation::{
     TrueTarget,
 };
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Datum, Timestamp, TrackFrame, TruthFrame,
+    BearingFrame, CameraCalibration, Channel, Datum, Timestamp, TrackFrame, TrueState, TruthFrame,
 };
 use serde::Serialize;
 
@@ -18,9 +18,10 @@ use crate::recorded::{self, Lacks};
 
 /// Hold the tracks of a recording against the truth in it, or two runs against each other.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  crossfix evaluate tracks.mcap --json\n  \
-                  crossfix evaluate tracks.mcap --min-cameras 3\n  \
-                  crossfix evaluate before.mcap after.mcap --save both.rrd")]
+#[command(after_help = "Examples:\n  \
+    crossfix evaluate tracks.mcap --json\n  \
+    crossfix evaluate tracks.mcap --min-cameras 3\n  \
+    crossfix evaluate before.mcap after.mcap --save both.rrd")]
 pub struct Args {
     /// The recording (MCAP) with tracks and truth.
     recording: PathBuf,
@@ -53,8 +54,13 @@ pub struct Question {
           allow_negative_numbers = true)]
     pub skip_s: f64,
     /// Standard deviation of the truth's places, metres per axis: what it may be off by itself.
-    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::metres_or_none,
-          allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 0.0,
+        value_name = "METRES",
+        value_parser = numbers::metres_or_none,
+        allow_negative_numbers = true
+    )]
     pub truth_sd: f64,
     /// Only the instants at which so many cameras saw something: in the frame just before and in
     /// that just after.
@@ -153,14 +159,16 @@ impl EvaluatedRun {
 }
 
 fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
-    let target = |state: &crossfix_message::TrueState| {
-        Some(TrueTarget {
-            id: state.id,
-            position: state.position?.into(),
-            velocity: state.velocity?.into(),
-        })
-    };
     frame.targets.iter().filter_map(target).collect()
+}
+
+/// A target whose position and velocity are known.
+fn target(state: &TrueState) -> Option<TrueTarget> {
+    Some(TrueTarget {
+        id: state.id,
+        position: state.position?.into(),
+        velocity: state.velocity?.into(),
+    })
 }
 
 /// Evaluates a recording.

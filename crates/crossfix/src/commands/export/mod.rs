@@ -1,5 +1,6 @@
 mod others;
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -17,13 +18,18 @@ use crate::recorded::{self, Lacks};
 /// metres, metres per second, what the track is (confirmed or coasting; with --all also tentative
 /// and one-camera), how many cameras have given it a bearing within the second before, the root of
 /// the sum of the position's variances, metres, and the standard deviation of t, which is not in
-/// these: what all clocks are off by together, seconds. With --times, the state of each track at those
-/// times from its last frame at or before them, extrapolated with its velocity.
+/// these: what all clocks are off by together, seconds. With --times, the state of each track at
+/// those times from its last frame at or before them, extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
 #[command(
+    override_usage = "crossfix export [OPTIONS] <RECORDING> \\\n           \
+        <--csv|--geojson|--kml|--cot|--sapient|--asterix|--foxglove> <FILE> ...",
     group = clap::ArgGroup::new("written").required(true).multiple(true)
         .args(["csv", "geojson", "kml", "cot", "sapient", "asterix", "foxglove"]),
-    after_help = "Examples:\n  crossfix export tracks.mcap --csv tracks.csv --times times.csv\n  crossfix export tracks.mcap --kml flights.kml --anchor 48.3538,11.7861,490\n  crossfix export site.mcap --foxglove shown.mcap"
+    after_help = "Examples:\n  \
+        crossfix export tracks.mcap --csv tracks.csv --times times.csv\n  \
+        crossfix export tracks.mcap --kml flights.kml --anchor 48.3538,11.7861,490\n  \
+        crossfix export site.mcap --foxglove shown.mcap"
 )]
 pub struct Args {
     /// The recording (MCAP) with tracks.
@@ -70,6 +76,37 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
+    let history = read_history(args)?;
+    let inputs: Vec<&Path> =
+        std::iter::once(&args.recording).chain(&args.times).map(PathBuf::as_path).collect();
+    let draft = Draft::new(csv, &inputs)?;
+    let cannot_write = || format!("cannot write {}", csv.display());
+    let mut table = Table::create(draft.path()).with_context(cannot_write)?;
+    table.writer.write_record(COLUMNS)?;
+    let at = |time| if args.all { history.all_at(time) } else { history.at(time) };
+    match &args.times {
+        Some(path) => {
+            let mut reader = ::csv::Reader::from_path(path)
+                .with_context(|| format!("cannot read {}", path.display()))?;
+            for row in reader.deserialize() {
+                let TimeRow { t } =
+                    row.with_context(|| format!("{} needs a column `t`", path.display()))?;
+                table.write(t, &at(Timestamp::from_seconds(t)))?;
+            }
+        }
+        None => {
+            for time in history.times() {
+                table.write(time.seconds(), &at(time))?;
+            }
+        }
+    }
+    let rows = table.finish().with_context(cannot_write)?;
+    draft.keep()?;
+    output::line(format!("{rows} rows written to {}", csv.display()));
+    Ok(())
+}
+
+fn read_history(args: &Args) -> anyhow::Result<TrackHistory> {
     let mut history = TrackHistory::default();
     let mut lacks = Lacks::default();
     let mut frames = 0_u64;
@@ -86,59 +123,41 @@ fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
     lacks.say(&args.recording);
     let what = if args.smoothed { "smoothed tracks" } else { "tracks" };
     lacks.ensure_found(frames > 0, what, &args.recording)?;
-    let inputs: Vec<&Path> =
-        std::iter::once(&args.recording).chain(&args.times).map(PathBuf::as_path).collect();
-    let draft = Draft::new(csv, &inputs)?;
-    let mut writer = ::csv::Writer::from_path(draft.path())
-        .with_context(|| format!("cannot write {}", csv.display()))?;
-    writer.write_record([
-        "t",
-        "track_id",
-        "x",
-        "y",
-        "z",
-        "vx",
-        "vy",
-        "vz",
-        "state",
-        "cameras",
-        "sd_m",
-        "time_sd_s",
-    ])?;
-    let mut rows = 0_u64;
-    let mut write = |time: f64, estimates: &[Estimate]| -> anyhow::Result<()> {
+    Ok(history)
+}
+
+const COLUMNS: [&str; 12] =
+    ["t", "track_id", "x", "y", "z", "vx", "vy", "vz", "state", "cameras", "sd_m", "time_sd_s"];
+
+/// A table of tracks that is being written.
+struct Table {
+    writer: ::csv::Writer<File>,
+    rows: u64,
+}
+
+impl Table {
+    fn create(path: &Path) -> ::csv::Result<Self> {
+        Ok(Self { writer: ::csv::Writer::from_path(path)?, rows: 0 })
+    }
+
+    /// Writes a row for each track at a time, s.
+    fn write(&mut self, time_s: f64, estimates: &[Estimate]) -> ::csv::Result<()> {
         for estimate in estimates {
-            let mut record = vec![format!("{time:.9}"), estimate.id.to_string()];
+            let mut record = vec![format!("{time_s:.9}"), estimate.id.to_string()];
             record.extend(estimate.state.mean.iter().map(|value| format!("{value:.6}")));
             record.push(word(estimate.status).to_owned());
             record.push(estimate.cameras.to_string());
             record.push(format!("{:.6}", estimate.position_sd_m()));
             record.push(format!("{:.6}", estimate.time_sd_s));
-            writer.write_record(&record)?;
-            rows += 1;
+            self.writer.write_record(&record)?;
+            self.rows += 1;
         }
         Ok(())
-    };
-    let at = |time| if args.all { history.all_at(time) } else { history.at(time) };
-    match &args.times {
-        Some(path) => {
-            let mut reader = ::csv::Reader::from_path(path)
-                .with_context(|| format!("cannot read {}", path.display()))?;
-            for row in reader.deserialize() {
-                let TimeRow { t } =
-                    row.with_context(|| format!("{} needs a column `t`", path.display()))?;
-                write(t, &at(Timestamp::from_seconds(t)))?;
-            }
-        }
-        None => {
-            for time in history.times() {
-                write(time.seconds(), &at(time))?;
-            }
-        }
     }
-    writer.flush().with_context(|| format!("cannot write {}", csv.display()))?;
-    drop(writer);
-    draft.keep()?;
-    output::line(format!("{rows} rows written to {}", csv.display()));
-    Ok(())
+
+    /// Closes the file; returns the number of rows.
+    fn finish(mut self) -> std::io::Result<u64> {
+        self.writer.flush()?;
+        Ok(self.rows)
+    }
 }

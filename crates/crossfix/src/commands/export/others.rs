@@ -27,7 +27,13 @@ pub struct OtherFormats {
     #[arg(long, value_name = "FILE", requires = "anchor")]
     kml: Option<PathBuf>,
     /// With --kml: how high the geoid (mean sea level) is above the ellipsoid there, metres.
-    #[arg(long, value_name = "METRES", default_value_t = 0.0, value_parser = numbers::height_difference, allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "METRES",
+        default_value_t = 0.0,
+        value_parser = numbers::height_difference,
+        allow_hyphen_values = true
+    )]
     geoid: f64,
     /// Write events of Cursor on Target, one after the other.
     #[arg(long, value_name = "FILE", requires = "anchor")]
@@ -38,8 +44,8 @@ pub struct OtherFormats {
     /// Write blocks of ASTERIX category 062.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     asterix: Option<PathBuf>,
-    /// Write the recording again with Foxglove's schemas beside ours (MCAP): it opens in Foxglove and
-    /// Rerun without Crossfix.
+    /// Write the recording again with Foxglove's schemas beside ours (MCAP): it opens in Foxglove
+    /// and Rerun without Crossfix.
     #[arg(long, value_name = "FILE")]
     foxglove: Option<PathBuf>,
     /// How often the targets' places are said in the formats of others, a second.
@@ -47,7 +53,12 @@ pub struct OtherFormats {
     rate_hz: f64,
     /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
     /// ellipsoid.
-    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "LAT,LON,HEIGHT",
+        value_parser = numbers::place,
+        allow_hyphen_values = true
+    )]
     anchor: Option<Geodetic>,
     #[command(flatten)]
     formats: FormatArgs,
@@ -90,9 +101,6 @@ fn site_of(recording: &Path) -> anyhow::Result<SiteName> {
 /// twice as much the beginning of a run that is three seconds earlier is left out.
 const OUT_OF_ORDER_S: f64 = 2.0;
 
-/// Function that writes messages.
-type Put<'a> = dyn FnMut(Vec<Vec<u8>>) -> anyhow::Result<()> + 'a;
-
 /// A recording's tracks, to be passed to an outlet.
 struct Told<'a> {
     recording: &'a Path,
@@ -111,18 +119,11 @@ impl Told<'_> {
         let Some(path) = path else { return Ok(()) };
         let cannot_write = || format!("cannot write {}", path.display());
         let draft = Draft::new(path, &[self.recording])?;
-        let mut file = BufWriter::new(File::create(draft.path()).with_context(cannot_write)?);
-        let mut messages = 0_u64;
-        let mut put = |said: Vec<Vec<u8>>| -> anyhow::Result<()> {
-            for message in said {
-                messages += 1;
-                file.write_all(&message).with_context(cannot_write)?;
-            }
-            Ok(())
-        };
-        self.tell(&mut *outlet()?, &mut put)?;
-        file.flush().with_context(cannot_write)?;
-        drop(file);
+        let file = BufWriter::new(File::create(draft.path()).with_context(cannot_write)?);
+        let mut written =
+            OutletFile { path, file, outlet: outlet()?, is_greeted: false, messages: 0 };
+        self.tell(&mut written)?;
+        let messages = written.finish()?;
         draft.keep()?;
         let count = if messages == 1 { String::new() } else { format!(": {messages} messages") };
         output::line(format!("{} written{count}", path.display()));
@@ -130,20 +131,13 @@ impl Told<'_> {
     }
 
     /// Passes the tracks to an outlet at even intervals of data time.
-    fn tell(&self, outlet: &mut dyn Outlet, put: &mut Put<'_>) -> anyhow::Result<()> {
+    fn tell(&self, written: &mut OutletFile<'_>) -> anyhow::Result<()> {
         let mut situation = Situation::new(self.site.clone(), self.anchor);
         let period_s = self.rate_hz.recip();
         let mut next: Option<Timestamp> = None;
         let mut last = Timestamp::EPOCH;
         let mut lacks = Lacks::default();
         let mut frames = 0_u64;
-        let mut is_greeted = false;
-        let mut greet = |outlet: &mut dyn Outlet, now: Timestamp, put: &mut Put<'_>| {
-            if std::mem::replace(&mut is_greeted, true) {
-                return Ok(());
-            }
-            put(outlet.greeting(now))
-        };
         recorded::for_each(self.recording, &mut lacks, |lacks, entry| {
             match &entry.key.channel {
                 Channel::Calibration(_) => {
@@ -153,8 +147,9 @@ impl Told<'_> {
                 }
                 Channel::Events => {
                     if let Some(event) = lacks.read::<TrackEvent>(&entry.data) {
-                        greet(outlet, Timestamp::from_nanos(event.time_ns), put)?;
-                        put(outlet.event(&event))?;
+                        written.greet(Timestamp::from_nanos(event.time_ns))?;
+                        let messages = written.outlet.event(&event);
+                        written.put(messages)?;
                     }
                 }
                 channel if channel == self.channel => {
@@ -169,9 +164,11 @@ impl Told<'_> {
                     });
                     if is_due {
                         next = Some(last.plus_seconds(period_s));
-                        greet(outlet, last, put)?;
-                        let snapshot = situation.snapshot(0.0);
-                        put(snapshot.iter().flat_map(|s| outlet.tracks(s)).collect())?;
+                        written.greet(last)?;
+                        if let Some(snapshot) = situation.snapshot(0.0) {
+                            let messages = written.outlet.tracks(&snapshot);
+                            written.put(messages)?;
+                        }
                     }
                 }
                 _ => {}
@@ -180,7 +177,44 @@ impl Told<'_> {
         })?;
         lacks.say(self.recording);
         lacks.ensure_found(frames > 0, "tracks", self.recording)?;
-        put(outlet.farewell(last))
+        let messages = written.outlet.farewell(last);
+        written.put(messages)
+    }
+}
+
+/// A file that an outlet's messages are written to.
+struct OutletFile<'a> {
+    path: &'a Path,
+    file: BufWriter<File>,
+    outlet: Box<dyn Outlet>,
+    is_greeted: bool,
+    messages: u64,
+}
+
+impl OutletFile<'_> {
+    /// Writes the outlet's greeting, the first time.
+    fn greet(&mut self, now: Timestamp) -> anyhow::Result<()> {
+        if std::mem::replace(&mut self.is_greeted, true) {
+            return Ok(());
+        }
+        let messages = self.outlet.greeting(now);
+        self.put(messages)
+    }
+
+    fn put(&mut self, messages: Vec<Vec<u8>>) -> anyhow::Result<()> {
+        for message in messages {
+            self.messages += 1;
+            self.file
+                .write_all(&message)
+                .with_context(|| format!("cannot write {}", self.path.display()))?;
+        }
+        Ok(())
+    }
+
+    /// Closes the file; returns the number of messages.
+    fn finish(mut self) -> anyhow::Result<u64> {
+        self.file.flush().with_context(|| format!("cannot write {}", self.path.display()))?;
+        Ok(self.messages)
     }
 }
 

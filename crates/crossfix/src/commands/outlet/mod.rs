@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail, ensure};
 use crossfix_geometry::Geodetic;
 use crossfix_message::{
-    CameraCalibration, Channel, Key, Timestamp, TrackEvent, TrackFrame, decode,
+    CameraCalibration, Channel, Key, SiteName, Timestamp, TrackEvent, TrackFrame, decode,
 };
 use crossfix_outlet::{
     Asterix, CursorOnTarget, GeoJsonLines, Outlet, Sapient, Situation, Snapshot,
@@ -40,28 +40,35 @@ const MOST_EVENTS: usize = 1000;
 /// Tell programs of others where the targets are, live.
 ///
 /// cot: Cursor on Target, for TAK. sapient: BSI Flex 335 v2.0. asterix: category 062. geojson: a
-/// collection a line. foxglove: a server that Foxglove connects to. What each says of its uncertainty
-/// is in docs/outlets.md.
+/// collection a line. foxglove: a server that Foxglove connects to. What each says of its
+/// uncertainty is in docs/outlets.md.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix outlet cot -c my-site/network.toml --to udp://239.2.3.1:6969\n  crossfix outlet sapient -c my-site/network.toml --to tcp://10.0.0.9:5020\n  crossfix outlet geojson -c my-site/network.toml\n  crossfix outlet foxglove -c my-site/network.toml --listen 127.0.0.1:8765"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix outlet cot -c my-site/network.toml --to udp://239.2.3.1:6969\n  \
+    crossfix outlet sapient -c my-site/network.toml --to tcp://10.0.0.9:5020\n  \
+    crossfix outlet geojson -c my-site/network.toml\n  \
+    crossfix outlet foxglove -c my-site/network.toml --listen 127.0.0.1:8765")]
 pub struct Args {
     /// The format.
     format: Format,
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Where to: udp://HOST:PORT (multicast too), tcp://HOST:PORT, tls://HOST:PORT, a file, or - for
-    /// stdout.
+    /// Where to: udp://HOST:PORT (multicast too), tcp://HOST:PORT, tls://HOST:PORT, a file, or -
+    /// for stdout.
     #[arg(long, value_name = "DESTINATION", default_value = "-")]
     to: Destination,
     /// How often, a second; by default once, SAPIENT twice, ASTERIX every four seconds.
     #[arg(long, value_name = "HERTZ", value_parser = numbers::outlet_rate)]
     rate_hz: Option<f64>,
-    /// Where on Earth the site's origin is, in the place of the network file's `[anchor]`: degrees north,
-    /// degrees east, metres above the WGS84 ellipsoid.
-    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    /// Where on Earth the site's origin is, in the place of the network file's `[anchor]`: degrees
+    /// north, degrees east, metres above the WGS84 ellipsoid.
+    #[arg(
+        long,
+        value_name = "LAT,LON,HEIGHT",
+        value_parser = numbers::place,
+        allow_hyphen_values = true
+    )]
     anchor: Option<Geodetic>,
     #[command(flatten)]
     formats: FormatArgs,
@@ -122,6 +129,19 @@ impl Format {
     }
 }
 
+impl Args {
+    /// What writes the format.
+    fn outlet(&self, site: &SiteName) -> anyhow::Result<Box<dyn Outlet>> {
+        Ok(match self.format {
+            Format::Cot => Box::new(self.formats.cot_type.clone()),
+            Format::Sapient => Box::new(Sapient::of_site(site.clone())),
+            Format::Asterix => Box::new(self.formats.asterix_source.clone()),
+            Format::Geojson => Box::new(GeoJsonLines),
+            Format::Foxglove => bail!("Foxglove is served"),
+        })
+    }
+}
+
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
     let network = config::load_network(&args.config)?;
@@ -141,13 +161,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         args.format != Format::Sapient || args.to.answers(),
         "SAPIENT waits for an answer: --to tcp://HOST:PORT or tls://HOST:PORT"
     );
-    let mut outlet: Box<dyn Outlet> = match args.format {
-        Format::Cot => Box::new(args.formats.cot_type.clone()),
-        Format::Sapient => Box::new(Sapient::of_site(site.clone())),
-        Format::Asterix => Box::new(args.formats.asterix_source.clone()),
-        Format::Geojson => Box::new(GeoJsonLines),
-        Format::Foxglove => bail!("Foxglove is served"),
-    };
+    let mut outlet = args.outlet(&site)?;
     let tls = matches!(args.to, Destination::Tls(_)).then(|| args.tls.client()).transpose()?;
     let mut carrier = Carrier::new(args.to.clone(), tls);
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {

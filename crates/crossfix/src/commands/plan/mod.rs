@@ -3,7 +3,7 @@ mod geojson;
 mod picture;
 mod report;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_evaluation::bound::{Assumptions, PlannedCamera, TargetSize, Volume};
@@ -22,57 +22,124 @@ use crate::planned;
 /// straight: no tracker is better, and a good one is near it. Only the cameras' files and their
 /// intrinsics are read; neither videos nor a network need be there.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix plan configs/site --target-size 1\n  crossfix plan configs/site --min -80,-80,10 --max 80,80,120 --save plan.rrd\n  crossfix plan configs/site --geojson plan.geojson --anchor 48.3538,11.7861,490"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix plan configs/site --target-size 1\n  \
+    crossfix plan configs/site --min -80,-80,10 --max 80,80,120 --save plan.rrd\n  \
+    crossfix plan configs/site --geojson plan.geojson --anchor 48.3538,11.7861,490")]
 pub struct Args {
     /// The site's folder, with a file per camera (TOML).
     #[arg(value_name = "SITE_FOLDER")]
     site: PathBuf,
     /// The volume's low corner, local ENU, metres. Default: a box round where the optical axes
     /// cross.
-    #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true, requires = "max")]
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        value_parser = triple,
+        allow_hyphen_values = true,
+        requires = "max"
+    )]
     min: Option<[f64; 3]>,
     /// The volume's high corner, local ENU, metres.
-    #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true, requires = "min")]
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        value_parser = triple,
+        allow_hyphen_values = true,
+        requires = "min"
+    )]
     max: Option<[f64; 3]>,
     /// Side of a cell, metres. Default: a twelfth of the volume's longest side, made round.
-    #[arg(long, value_name = "METRES", value_parser = numbers::distance, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "METRES",
+        value_parser = numbers::distance,
+        allow_negative_numbers = true
+    )]
     step: Option<f64>,
     /// How long a target has been seen, flying straight, seconds (at most 60).
     #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = window)]
     window: f64,
     /// Standard deviation of a target's place in the image, pixels per axis. Default: what each
     /// camera's calibration has found of its labels; 0.5 without.
-    #[arg(long, value_name = "PIXELS", value_parser = numbers::pixels, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "PIXELS",
+        value_parser = numbers::pixels,
+        allow_negative_numbers = true
+    )]
     pixel_sd: Option<f64>,
-    /// Standard deviation of the cameras' rotation, degrees per axis. Default: each camera's own, from
-    /// its calibration or file; a careful survey's 0.057 (1 mrad) where nobody has said.
-    #[arg(long, value_name = "DEGREES", value_parser = numbers::degrees, allow_negative_numbers = true)]
+    /// Standard deviation of the cameras' rotation, degrees per axis. Default: each camera's own,
+    /// from its calibration or file; a careful survey's 0.057 (1 mrad) where nobody has said.
+    #[arg(
+        long,
+        value_name = "DEGREES",
+        value_parser = numbers::degrees,
+        allow_negative_numbers = true
+    )]
     rotation_sd_deg: Option<f64>,
-    /// Standard deviation of the cameras' positions, metres per axis. Default: each camera's own, or a
-    /// careful survey's 0.05.
-    #[arg(long, value_name = "METRES", value_parser = numbers::metres_or_none, allow_negative_numbers = true)]
+    /// Standard deviation of the cameras' positions, metres per axis. Default: each camera's own,
+    /// or a careful survey's 0.05.
+    #[arg(
+        long,
+        value_name = "METRES",
+        value_parser = numbers::metres_or_none,
+        allow_negative_numbers = true
+    )]
     position_sd: Option<f64>,
     /// Standard deviation of the cameras' clocks, seconds. Default: each camera's own, from its
     /// file.
-    #[arg(long, value_name = "SECONDS", value_parser = numbers::seconds_of_an_hour, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        value_parser = numbers::seconds_of_an_hour,
+        allow_negative_numbers = true
+    )]
     clock_sd: Option<f64>,
     /// How fast targets fly, metres per second: what an error of a clock is worth.
-    #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = numbers::metres_per_second, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 15.0,
+        value_name = "METRES_PER_SECOND",
+        value_parser = numbers::metres_per_second,
+        allow_negative_numbers = true
+    )]
     speed: f64,
     /// What is known of a target's velocity beforehand: standard deviation, metres per second per
     /// axis; 0 is nothing.
-    #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = numbers::metres_per_second, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 15.0,
+        value_name = "METRES_PER_SECOND",
+        value_parser = numbers::metres_per_second,
+        allow_negative_numbers = true
+    )]
     velocity_prior_sd: f64,
     /// Size of the target, metres: how far it is seen; 0 is from anywhere.
-    #[arg(long, default_value_t = 0.4, value_name = "METRES", value_parser = numbers::metres_or_none, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 0.4,
+        value_name = "METRES",
+        value_parser = numbers::metres_or_none,
+        allow_negative_numbers = true
+    )]
     target_size: f64,
     /// Pixels that the target must span to be seen.
-    #[arg(long, default_value_t = 6.0, value_name = "PIXELS", value_parser = numbers::pixels, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 6.0,
+        value_name = "PIXELS",
+        value_parser = numbers::pixels,
+        allow_negative_numbers = true
+    )]
     min_pixels: f64,
     /// Farther than this nothing is seen, metres.
-    #[arg(long, value_name = "METRES", value_parser = numbers::distance, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "METRES",
+        value_parser = numbers::distance,
+        allow_negative_numbers = true
+    )]
     max_range: Option<f64>,
     /// Print JSON, with every cell and every candidate.
     #[arg(long)]
@@ -82,7 +149,12 @@ pub struct Args {
     geojson: Option<PathBuf>,
     /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
     /// ellipsoid.
-    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "LAT,LON,HEIGHT",
+        value_parser = numbers::place,
+        allow_hyphen_values = true
+    )]
     anchor: Option<Geodetic>,
     /// Write the coloured volume as a picture for Rerun (.rrd).
     #[arg(long, value_name = "FILE")]
@@ -120,26 +192,6 @@ impl Args {
 impl Args {
     /// The site's cameras, with values from the options in place of those from their files.
     fn cameras(&self) -> anyhow::Result<Vec<PlannedCamera>> {
-        let planned = |(path, file): (PathBuf, config::CameraFile)| {
-            let rate_hz = file.rate_hz()?;
-            if let Some(rate_hz) = rate_hz {
-                ensure!(
-                    (0.01..=1000.0).contains(&rate_hz),
-                    "{}: {rate_hz} frames a second: it must be from 0.01 to 1000",
-                    path.display()
-                );
-            }
-            let mut camera = planned::of_file(&file, &path, rate_hz)?;
-            camera.clock_sd_s = self.clock_sd.unwrap_or(camera.clock_sd_s);
-            camera.pixel_sd_px = self.pixel_sd.unwrap_or(camera.pixel_sd_px);
-            let rotation_sd_rad = self.rotation_sd_deg.map(f64::to_radians);
-            for (first, sd) in [(0, rotation_sd_rad), (3, self.position_sd)] {
-                if let Some(sd) = sd {
-                    planned::hold(&mut camera.pose_covariance, first, sd);
-                }
-            }
-            Ok(camera)
-        };
         let (turned, still): (Vec<_>, Vec<_>) = config::load_cameras(&self.site)?
             .into_iter()
             .partition(|(_, file)| file.mount.is_some());
@@ -149,7 +201,28 @@ impl Args {
                 file.name
             );
         }
-        still.into_iter().map(planned).collect()
+        still.iter().map(|(path, file)| self.camera(path, file)).collect()
+    }
+
+    fn camera(&self, path: &Path, file: &config::CameraFile) -> anyhow::Result<PlannedCamera> {
+        let rate_hz = file.rate_hz()?;
+        if let Some(rate_hz) = rate_hz {
+            ensure!(
+                (0.01..=1000.0).contains(&rate_hz),
+                "{}: {rate_hz} frames a second: it must be from 0.01 to 1000",
+                path.display()
+            );
+        }
+        let mut camera = planned::of_file(file, path, rate_hz)?;
+        camera.clock_sd_s = self.clock_sd.unwrap_or(camera.clock_sd_s);
+        camera.pixel_sd_px = self.pixel_sd.unwrap_or(camera.pixel_sd_px);
+        let rotation_sd_rad = self.rotation_sd_deg.map(f64::to_radians);
+        for (first, sd) in [(0, rotation_sd_rad), (3, self.position_sd)] {
+            if let Some(sd) = sd {
+                planned::hold(&mut camera.pose_covariance, first, sd);
+            }
+        }
+        Ok(camera)
     }
 }
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use crossfix_evaluation::bound::{CandidatePlace, PlannedCamera};
+use crossfix_evaluation::bound::{CandidatePlace, Cell, PlannedCamera};
 use crossfix_view::{DrawnPlace, VolumeCell, VolumePicture};
 use nalgebra::Point3;
 
@@ -31,12 +31,14 @@ fn landmark(report: &PlanReport, candidate: &CandidatePlace) -> DrawnPlace {
     }
 }
 
+/// A cell of the volume, if it has a fix.
+fn cell(cell: &Cell) -> Option<VolumeCell> {
+    let sd_m = cell.accuracy.as_ref()?.position_sd_m;
+    Some(VolumeCell { centre: Point3::from(cell.centre_m), sd_m })
+}
+
 /// Writes the picture to a file.
 pub fn draw(report: &PlanReport, cameras: &[PlannedCamera], path: &Path) -> anyhow::Result<()> {
-    let cell = |cell: &crossfix_evaluation::bound::Cell| {
-        let sd_m = cell.accuracy.as_ref()?.position_sd_m;
-        Some(VolumeCell { centre: Point3::from(cell.centre_m), sd_m })
-    };
     let candidates = report.advice.iter().flat_map(|advice| &advice.candidates);
     let picture = VolumePicture {
         cameras: cameras.iter().map(|planned| (planned.name.clone(), &planned.camera)).collect(),

@@ -99,16 +99,6 @@ fn layer_table(report: &PlanReport) -> String {
         "velocity SD [m/s]: 50 %",
         "degenerate",
     ];
-    let row = |name: String, layer: &Summary| {
-        vec![
-            name,
-            percent(layer.fixed),
-            output::number(layer.position_sd_median_m, 3),
-            output::number(layer.position_sd_90_m, 3),
-            output::number(layer.velocity_sd_median_mps, 3),
-            layer.degenerate.map_or_else(|| "-".to_owned(), percent),
-        ]
-    };
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     let whole = report
         .layers
@@ -116,10 +106,24 @@ fn layer_table(report: &PlanReport) -> String {
         .all(|layer| (layer.altitude_m - layer.altitude_m.round()).abs() < 1e-6);
     let decimals = if whole { 0 } else { 1 };
     rows.extend(
-        report.layers.iter().map(|layer| row(format!("{:.decimals$}", layer.altitude_m), layer)),
+        report
+            .layers
+            .iter()
+            .map(|layer| layer_row(format!("{:.decimals$}", layer.altitude_m), layer)),
     );
-    rows.push(row("all".to_owned(), &report.whole));
+    rows.push(layer_row("all".to_owned(), &report.whole));
     output::table(&rows)
+}
+
+fn layer_row(name: String, layer: &Summary) -> Vec<String> {
+    vec![
+        name,
+        percent(layer.fixed),
+        output::number(layer.position_sd_median_m, 3),
+        output::number(layer.position_sd_90_m, 3),
+        output::number(layer.velocity_sd_median_mps, 3),
+        layer.degenerate.map_or_else(|| "-".to_owned(), percent),
+    ]
 }
 
 fn camera_table(report: &PlanReport) -> String {

@@ -32,17 +32,27 @@ const LAST_SHARE: f64 = 0.1;
 pub struct Limits {
     /// Begin a new file whenever one is so large, MB. Files are named by when they begin:
     /// today-20261125T221700Z.mcap.
-    #[arg(long, value_name = "MB", value_parser = numbers::megabytes, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "MB",
+        value_parser = numbers::megabytes,
+        allow_negative_numbers = true
+    )]
     rotate_mb: Option<f64>,
     /// Begin a new file after so many minutes.
-    #[arg(long, value_name = "MINUTES", value_parser = numbers::minutes, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "MINUTES",
+        value_parser = numbers::minutes,
+        allow_negative_numbers = true
+    )]
     rotate_min: Option<f64>,
     /// Remove the oldest of the files that are named so, also those of earlier runs, when together
     /// they take more, GB.
     #[arg(long, value_name = "GB", value_parser = numbers::quota, allow_negative_numbers = true)]
     quota_gb: Option<f64>,
-    /// What is left free on the disk, GB. With less of it the oldest of these files goes; where there
-    /// is none, pictures are not recorded, and with a tenth of it, nothing but bearings,
+    /// What is left free on the disk, GB. With less of it the oldest of these files goes; where
+    /// there is none, pictures are not recorded, and with a tenth of it, nothing but bearings,
     /// calibrations and tracks.
     #[arg(long, value_name = "GB", default_value_t = 0.5, value_parser = numbers::gigabytes,
           allow_negative_numbers = true)]
@@ -264,17 +274,17 @@ impl RecordFiles {
         let folder = self.asked.parent().filter(|folder| !folder.as_os_str().is_empty());
         let Ok(entries) = std::fs::read_dir(folder.unwrap_or(Path::new("."))) else { return };
         let (stem, extension) = parts(&self.asked);
-        let begins_at = |name: &str| -> Option<String> {
-            let begins = name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&extension)?;
-            is_a_beginning(begins).then(|| begins.to_owned())
-        };
         let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
         let mut found: Vec<(usize, String, PathBuf)> = names
             .filter_map(|name| {
                 let path = self.asked.with_file_name(&name);
                 // Files of this run are ordered by their end, and are all younger than others.
                 let ended = self.ended.iter().position(|ended| *ended == path);
-                Some((ended.map_or(0, |place| place + 1), begins_at(&name)?, path))
+                Some((
+                    ended.map_or(0, |place| place + 1),
+                    begins_at(&name, &stem, &extension)?,
+                    path,
+                ))
             })
             .filter(|(_, _, path)| path != self.path() && path.is_file())
             .collect();
@@ -282,6 +292,12 @@ impl RecordFiles {
         self.older =
             found.into_iter().rev().map(|(_, _, path)| (path.clone(), bytes(&path))).collect();
     }
+}
+
+/// The time in a file's name between two parts of it, if it is of that form.
+fn begins_at(name: &str, stem: &str, extension: &str) -> Option<String> {
+    let begins = name.strip_prefix(stem)?.strip_prefix('-')?.strip_suffix(extension)?;
+    is_a_beginning(begins).then(|| begins.to_owned())
 }
 
 /// Whether a text is the time in a file's name, with a number after it if two files began in one

@@ -37,9 +37,9 @@ const POLL: Duration = Duration::from_millis(50);
 
 /// Record everything that a site publishes.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix record -c configs/site/network.toml -o today.mcap\n  crossfix record -c configs/site/network.toml -o site.mcap --rotate-min 10 --quota-gb 200"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix record -c configs/site/network.toml -o today.mcap\n  \
+    crossfix record -c configs/site/network.toml -o site.mcap --rotate-min 10 --quota-gb 200")]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
@@ -56,8 +56,8 @@ pub struct Args {
     #[command(flatten)]
     video: VideoArgs,
     /// What is written a second time in Foxglove's schemas, so that the files open in Foxglove and
-    /// Rerun without Crossfix: all of cameras, pictures and tracks; the site without pictures, which
-    /// are most of a recording; or none.
+    /// Rerun without Crossfix: all of cameras, pictures and tracks; the site without pictures,
+    /// which are most of a recording; or none.
     #[arg(long, value_enum, default_value_t)]
     foxglove: WithFoxglove,
     #[command(flatten)]
@@ -93,10 +93,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
     service::ready(&format!("recording to {path}"));
     let mut disk = Disk { files, source, syncing: Syncing::start()?, rescued: None };
-    let mut parts = (subscription, lookout, health);
-    let recorded = work(&mut recorder, &mut disk, &mut parts, &shutdown)
+    let mut network_parts = NetworkParts { subscription, lookout, reporter: health };
+    let recorded = work(&mut recorder, &mut disk, &mut network_parts, &shutdown)
         .context("recording has stopped; the rest of the site goes on");
-    drop((parts, alive));
+    drop((network_parts, alive));
     let finished = recorded.and_then(|()| Ok(recorder.finish()?));
     let Disk { files, syncing, .. } = disk;
     if let Err(error) = syncing.finish(files.path(), SYNCED_WITHIN) {
@@ -109,6 +109,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         (messages, files) => format!("{messages} messages recorded to {files} files, last {path}"),
     });
     Ok(())
+}
+
+/// What the recorder has open on the network.
+struct NetworkParts {
+    subscription: Subscription,
+    lookout: Lookout,
+    reporter: HealthReporter,
 }
 
 /// The files on the disk, and their syncing.
@@ -167,9 +174,10 @@ impl Disk {
 fn work(
     recorder: &mut Recorder,
     disk: &mut Disk,
-    (subscription, lookout, reporter): &mut (Subscription, Lookout, HealthReporter),
+    network: &mut NetworkParts,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
+    let NetworkParts { subscription, lookout, reporter } = network;
     let mut said_at = Instant::now();
     while !shutdown.requested() {
         if let Some(received) = subscription.next(POLL)

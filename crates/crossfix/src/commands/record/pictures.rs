@@ -30,10 +30,20 @@ pub struct VideoArgs {
     #[arg(long, value_enum, default_value_t)]
     video: Wanted,
     /// With --video tracks: from so long before the track is sure, seconds.
-    #[arg(long, value_name = "SECONDS", default_value_t = 10.0, value_parser = numbers::seconds_of_an_hour)]
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        default_value_t = 10.0,
+        value_parser = numbers::seconds_of_an_hour
+    )]
     video_before_s: f64,
     /// With --video tracks: until so long after it was last seen, seconds.
-    #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = numbers::seconds_of_an_hour)]
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        default_value_t = 5.0,
+        value_parser = numbers::seconds_of_an_hour
+    )]
     video_after_s: f64,
 }
 
@@ -119,10 +129,6 @@ impl<P> Pictures<P> {
     /// Takes tracks in: if one of them is confirmed, coasting or of one camera, returns all waiting
     /// pictures, in their order, to be recorded.
     pub fn see(&mut self, tracks: &TrackFrame, now: Instant) -> impl Iterator<Item = P> + '_ {
-        let is_sure = |state| {
-            use TrackState::{Coasting, Confirmed, OneCamera};
-            matches!(state, Confirmed | Coasting | OneCamera)
-        };
         let wanted = if tracks.tracks.iter().any(|track| is_sure(track.state())) {
             self.forget(now);
             self.until = Some(now + self.after);
@@ -133,6 +139,11 @@ impl<P> Pictures<P> {
         };
         self.waiting.drain(..wanted).map(|waiting| waiting.picture)
     }
+}
+
+fn is_sure(state: TrackState) -> bool {
+    use TrackState::{Coasting, Confirmed, OneCamera};
+    matches!(state, Confirmed | Coasting | OneCamera)
 }
 
 #[cfg(test)]

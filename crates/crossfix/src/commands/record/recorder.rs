@@ -166,13 +166,11 @@ impl Recorder {
         }
         let sender =
             origin.map_or_else(|| "an unknown program".to_owned(), |o| format!("run {}", o.run));
-        if let Some(origin) = origin {
-            let missing = self.reception.see(&key, origin, at);
-            if missing > 0 {
-                self.repeats.warn(&format!("missing {key}"), at, || {
-                    format!("{missing} messages on `{key}` from {sender} did not arrive")
-                });
-            }
+        let missing = origin.map_or(0, |origin| self.reception.see(&key, origin, at));
+        if missing > 0 {
+            self.repeats.warn(&format!("missing {key}"), at, || {
+                format!("{missing} messages on `{key}` from {sender} did not arrive")
+            });
         }
         let seen = match glance(&key.channel, &data) {
             Ok(Some(seen)) => seen,
@@ -201,7 +199,11 @@ impl Recorder {
             });
             self.times.now()
         };
-        let entry = Entry { key, data_time: seen.time, arrival, data };
+        self.record(Entry { key, data_time: seen.time, arrival, data }, said, at)
+    }
+
+    /// Records an entry of the site, or keeps it waiting if it is a picture.
+    fn record(&mut self, entry: Entry, said: Said, at: Instant) -> Result<(), RecordingError> {
         if matches!(entry.key.channel, Channel::Preview(_)) {
             let bytes = entry.data.len();
             let picture = self.pictures.take((entry, said), bytes, at);

@@ -15,9 +15,10 @@ use crate::recorded::{self, Lacks};
 
 /// Play a recording again: onto Zenoh, or with --fuse straight into the fusion.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix replay recordings/two-uavs.mcap --fuse -o tracks.mcap\n  crossfix replay recordings/two-uavs.mcap --network configs/site/network.toml --speed 2 --from 5 --to 20"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix replay recordings/two-uavs.mcap --fuse -o tracks.mcap\n  \
+    crossfix replay recordings/two-uavs.mcap --network configs/site/network.toml \\\n      \
+    --speed 2 --from 5 --to 20")]
 pub struct Args {
     /// The recording (MCAP).
     recording: PathBuf,
@@ -48,7 +49,12 @@ pub struct Args {
           allow_negative_numbers = true)]
     from: f64,
     /// End this long after the first bearing, seconds of data time.
-    #[arg(long, value_name = "SECONDS", value_parser = numbers::seconds, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        value_parser = numbers::seconds,
+        allow_negative_numbers = true
+    )]
     to: Option<f64>,
     /// The network's file (TOML) to publish on; the replay stands in for the site's cameras.
     #[arg(long, value_name = "FILE", conflicts_with = "fuse", required_unless_present = "fuse")]

@@ -24,6 +24,11 @@ const HEALTH_PERIOD_S: f64 = 1.0;
 struct OfflineFusion {
     centre: Centre,
     writer: RecordingWriter<std::io::BufWriter<std::fs::File>>,
+    /// What of the recording is fused.
+    range: Range,
+    /// Data time of the first entry taken, and the latest.
+    first: Option<Timestamp>,
+    until: Timestamp,
     frames: u64,
     /// Number of tracks that were confirmed.
     targets: u64,
@@ -45,21 +50,8 @@ pub fn fuse(
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
     let file = FusionFile::load(args.config.as_deref(), &args.sets)?;
-    let config = file.fusion().smoothed(args.smooth);
-    let is_smoothed = config.tracking.smoothing_s > 0.0;
     let draft = Draft::new(output, &[&args.recording])?;
-    let mut run = OfflineFusion {
-        centre: Centre::new(config, file.cameras)?,
-        is_smoothed,
-        writer: RecordingWriter::create(draft.path())?,
-        frames: 0,
-        targets: 0,
-        site: None,
-        healthy_at: None,
-        busy: Duration::ZERO,
-        longest: Duration::ZERO,
-    };
-    run.writer.sign(&Source::of("replay --fuse"))?;
+    let mut run = OfflineFusion::begin(args, file, range, draft.path())?;
     for entry in calibrations(&args.recording, range)? {
         let entry = match &recalibration {
             Some(recalibration) => recalibration.applied(entry),
@@ -71,27 +63,18 @@ pub fn fuse(
         }
     }
     let mut lacks = Lacks::default();
-    let (mut first, mut until) = (None, Timestamp::MIN);
-    let mut take = |entry: Entry| {
-        if range.holds(&entry) {
-            first.get_or_insert(entry.data_time);
-            until = until.max(entry.data_time);
-            run.take(&entry)?;
-        }
-        Ok(())
-    };
     let mut reordered = recalibration.map(Reordered::new);
     recorded::for_each_until(
         &args.recording,
         &mut lacks,
         &shutdown,
         |_, entry| match &mut reordered {
-            Some(reordered) => reordered.take(entry, &mut take),
-            None => take(entry),
+            Some(reordered) => reordered.take(entry).try_for_each(|entry| run.take(&entry)),
+            None => run.take(&entry),
         },
     )?;
     if let Some(reordered) = &mut reordered {
-        reordered.finish(&mut take)?;
+        reordered.finish().try_for_each(|entry| run.take(&entry))?;
     }
     lacks.say(&args.recording);
     lacks.ensure_found(run.frames > 0, "bearings in that range", &args.recording)?;
@@ -100,7 +83,7 @@ pub fn fuse(
     if shutdown.requested() {
         bail!(
             "stopped {:.1} s after the beginning: {} ends there",
-            until.seconds_since(first.unwrap_or(until)),
+            found.lasts_s,
             output.display()
         );
     }
@@ -112,6 +95,8 @@ struct Found {
     frames: u64,
     /// Number of tracks that were confirmed.
     targets: u64,
+    /// From the first entry to the last, s.
+    lasts_s: f64,
     /// Why it is nothing, if that is known.
     why_nothing: Option<String>,
 }
@@ -125,7 +110,35 @@ impl Found {
 }
 
 impl OfflineFusion {
+    fn begin(args: &Args, file: FusionFile, range: Range, path: &Path) -> anyhow::Result<Self> {
+        let config = file.fusion().smoothed(args.smooth);
+        let is_smoothed = config.tracking.smoothing_s > 0.0;
+        let centre = Centre::new(config, file.cameras)?;
+        let mut writer = RecordingWriter::create(path)?;
+        writer.sign(&Source::of("replay --fuse"))?;
+        Ok(Self {
+            centre,
+            writer,
+            range,
+            first: None,
+            until: Timestamp::MIN,
+            frames: 0,
+            targets: 0,
+            is_smoothed,
+            site: None,
+            healthy_at: None,
+            busy: Duration::ZERO,
+            longest: Duration::ZERO,
+        })
+    }
+
+    /// Takes an entry, if it is in the range.
     fn take(&mut self, entry: &Entry) -> anyhow::Result<()> {
+        if !self.range.holds(entry) {
+            return Ok(());
+        }
+        self.first.get_or_insert(entry.data_time);
+        self.until = self.until.max(entry.data_time);
         match &entry.key.channel {
             // Results of an earlier fusion of these bearings.
             Channel::Tracks
@@ -227,6 +240,11 @@ impl OfflineFusion {
             self.busy.as_secs_f64() * 1e6 / frames as f64,
             self.longest.as_secs_f64() * 1e3
         ));
-        Ok(Found { frames, targets: self.targets, why_nothing: self.centre.why_nothing() })
+        Ok(Found {
+            frames,
+            targets: self.targets,
+            lasts_s: self.until.seconds_since(self.first.unwrap_or(self.until)),
+            why_nothing: self.centre.why_nothing(),
+        })
     }
 }

@@ -151,18 +151,19 @@ impl Board {
         let centres = self.centres.iter().map(|centre| self.part(centre, None, now));
         let recorder =
             self.parts.contains_key("recorder").then(|| self.part("recorder", None, now));
-        let of = |wanted: &[TrackState]| {
-            let lives = |said: Instant| now.saturating_duration_since(said) < TRACK_LIVES;
-            let counted =
-                |(state, said): &&(TrackState, Instant)| wanted.contains(state) && lives(*said);
-            self.tracks.values().filter(counted).count()
-        };
         Status {
             site: self.site.clone(),
             parts: cameras.chain(centres).chain(recorder).collect(),
-            confirmed: of(&[TrackState::Confirmed, TrackState::Coasting]),
-            one_camera: of(&[TrackState::OneCamera]),
+            confirmed: self.count_tracks(&[TrackState::Confirmed, TrackState::Coasting], now),
+            one_camera: self.count_tracks(&[TrackState::OneCamera], now),
         }
+    }
+
+    /// Number of tracks that were lately in one of these states.
+    fn count_tracks(&self, wanted: &[TrackState], now: Instant) -> usize {
+        let lives = |said: Instant| now.saturating_duration_since(said) < TRACK_LIVES;
+        let tracks = self.tracks.values();
+        tracks.filter(|(state, said)| wanted.contains(state) && lives(*said)).count()
     }
 
     fn part(&self, name: &str, clock: Option<&CameraHealth>, now: Instant) -> ComponentRow {

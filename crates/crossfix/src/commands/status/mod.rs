@@ -34,9 +34,9 @@ const CLEARED: &str = "\x1b[H\x1b[2J";
 ///
 /// On a terminal until Ctrl-C; else, or with --once or --json, what is heard in three seconds.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix status -c configs/site/network.toml\n  crossfix status -c configs/site/network.toml --page 127.0.0.1:8080"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix status -c configs/site/network.toml\n  \
+    crossfix status -c configs/site/network.toml --page 127.0.0.1:8080")]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]

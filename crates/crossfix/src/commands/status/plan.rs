@@ -141,12 +141,15 @@ fn planned(name: &CameraName, calibration: &Calibration) -> CameraOnPlan {
 fn view(camera: &Camera) -> Option<[f64; 2]> {
     let size = camera.model().intrinsics().size;
     let middle = f64::from(size.height) / 2.0;
-    let azimuth = |x: f64| -> Option<f64> {
-        let direction = camera.model().direction(Pixel::new(x, middle)).ok()?;
-        let line: Vector3<f64> = camera.pose().rotation() * direction.into_inner();
-        Some(line.x.atan2(line.y).to_degrees())
-    };
-    Some([azimuth(0.0)?, azimuth(f64::from(size.width))?])
+    let left = azimuth_deg(camera, Pixel::new(0.0, middle))?;
+    let right = azimuth_deg(camera, Pixel::new(f64::from(size.width), middle))?;
+    Some([left, right])
+}
+
+fn azimuth_deg(camera: &Camera, pixel: Pixel) -> Option<f64> {
+    let direction = camera.model().direction(pixel).ok()?;
+    let line: Vector3<f64> = camera.pose().rotation() * direction.into_inner();
+    Some(line.x.atan2(line.y).to_degrees())
 }
 
 fn planned_track(track: &Track) -> Option<PlannedTrack> {

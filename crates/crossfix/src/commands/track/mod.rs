@@ -29,9 +29,10 @@ use table::Table;
 /// probability that it is there; sd_x, sd_y the standard deviations of its place in pixels; vx, vy
 /// its velocity in pixels per second.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv\n  crossfix track clip.mp4 --detect --csv clip.csv --save clip.rrd\n  crossfix track clip.mp4 --from 120 --box 100,80,20,14 --box 310,95,12,9 --csv clip.csv"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv\n  \
+    crossfix track clip.mp4 --detect --csv clip.csv --save clip.rrd\n  \
+    crossfix track clip.mp4 --from 120 --box 100,80,20,14 --box 310,95,12,9 --csv clip.csv")]
 pub struct Args {
     /// The video: .mp4 (H.264), .avi (Motion JPEG), .y4m, or a folder of PNG or JPEG images.
     video: PathBuf,

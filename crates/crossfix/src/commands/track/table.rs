@@ -52,14 +52,15 @@ impl Table {
     }
 }
 
+/// Standard deviation of a track's position along an axis, pixels, if it is known.
+fn deviation(track: &ImageTrack, axis: usize) -> String {
+    let covariances = track.covariances.as_ref();
+    covariances.map_or_else(String::new, |both| format!("{:.3}", both[axis].m11.max(0.0).sqrt()))
+}
+
 fn row(frame: u64, track: &ImageTrack, microseconds: f64) -> [String; COLUMNS.len()] {
     let place = PixelBox::about(track.position, track.width, track.height);
     let ok = u8::from(track.phase != TrackPhase::Searching);
-    let deviation = |axis: usize| {
-        let covariances = track.covariances.as_ref();
-        covariances
-            .map_or_else(String::new, |both| format!("{:.3}", both[axis].m11.max(0.0).sqrt()))
-    };
     [
         frame.to_string(),
         format!("{:.3}", place.x),
@@ -70,8 +71,8 @@ fn row(frame: u64, track: &ImageTrack, microseconds: f64) -> [String; COLUMNS.le
         format!("{microseconds:.1}"),
         track.id.to_string(),
         format!("{:.3}", track.certainty),
-        deviation(0),
-        deviation(1),
+        deviation(track, 0),
+        deviation(track, 1),
         format!("{:.2}", track.velocity.x),
         format!("{:.2}", track.velocity.y),
     ]

@@ -15,16 +15,26 @@ const MOST_SIDE: usize = 8192;
 
 #[derive(Debug, Default, clap::Args)]
 pub struct EarthArgs {
-    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84 ellipsoid.
-    /// A map is beside the site then; live it is the network file's `[anchor]` without.
-    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
+    /// ellipsoid. A map is beside the site then; live it is the network file's `[anchor]` without.
+    #[arg(
+        long,
+        value_name = "LAT,LON,HEIGHT",
+        value_parser = numbers::place,
+        allow_hyphen_values = true
+    )]
     anchor: Option<Geodetic>,
     /// A picture of the ground from above, north up (PNG or JPEG), to lie under the site.
     #[arg(long, value_name = "FILE", requires = "map_edges")]
     map: Option<PathBuf>,
     /// Where the picture of the ground ends: degrees north and east of its edges.
-    #[arg(long, value_name = "SOUTH,WEST,NORTH,EAST", value_parser = numbers::edges, allow_hyphen_values = true,
-          requires = "map")]
+    #[arg(
+        long,
+        value_name = "SOUTH,WEST,NORTH,EAST",
+        value_parser = numbers::edges,
+        allow_hyphen_values = true,
+        requires = "map"
+    )]
     map_edges: Option<[Geodetic; 2]>,
 }
 

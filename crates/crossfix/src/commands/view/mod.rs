@@ -22,9 +22,12 @@ pub use earth::EarthArgs;
 
 /// Show a site in Rerun: live, from a recording, or saved to an .rrd file.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix view recordings/two-uavs.mcap\n  crossfix view recordings/two-uavs.mcap --save two-uavs.rrd\n  crossfix view -c configs/site/network.toml\n  crossfix view today.mcap --anchor 48.3538,11.7861,490 --map site.png --map-edges 48.352,11.783,48.356,11.789"
-)]
+#[command(after_help = "Examples:\n  \
+    crossfix view recordings/two-uavs.mcap\n  \
+    crossfix view recordings/two-uavs.mcap --save two-uavs.rrd\n  \
+    crossfix view -c configs/site/network.toml\n  \
+    crossfix view today.mcap --anchor 48.3538,11.7861,490 --map site.png \\\n      \
+    --map-edges 48.352,11.783,48.356,11.789")]
 pub struct Args {
     /// The recording (MCAP) to show.
     #[arg(required_unless_present = "config", conflicts_with = "config")]

@@ -93,7 +93,8 @@ fn a_label_where_the_lens_has_no_direction_is_left_out_and_the_others_are_not() 
 
 #[test]
 fn the_velocity_beside_a_masked_sample_is_that_of_the_curve() {
-    let at = |t: f64| (t, Point3::new(1.0 + 2.0 * t + 3.0 * t * t, -t, 0.0));
+    let at =
+        |t: f64| RtkSample { time_s: t, place: Point3::new(1.0 + 2.0 * t + 3.0 * t * t, -t, 0.0) };
     let velocity = velocity_between(&at(0.8), &at(1.0), &at(1.6));
     assert!((velocity - Vector3::new(8.0, -1.0, 0.0)).norm() < 1e-12, "{velocity}");
 }

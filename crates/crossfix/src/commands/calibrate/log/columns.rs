@@ -16,12 +16,7 @@ const GEODETIC: [&str; 4] = ["time_s", "latitude_deg", "longitude_deg", "height_
 pub(super) fn read(path: &Path) -> anyhow::Result<Vec<LogRow>> {
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path)?;
     let head = reader.headers()?.clone();
-    let columns = |names: [&str; 4]| {
-        let found = names.map(|name| head.iter().position(|column| column == name));
-        let [Some(time), Some(x), Some(y), Some(z)] = found else { return None };
-        Some([time, x, y, z])
-    };
-    let (columns, is_geodetic) = match (columns(LOCAL), columns(GEODETIC)) {
+    let (columns, is_geodetic) = match (columns(&head, LOCAL), columns(&head, GEODETIC)) {
         (Some(local), _) => (local, false),
         (None, Some(geodetic)) => (geodetic, true),
         (None, None) => bail!(
@@ -39,6 +34,13 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Vec<LogRow>> {
     }
     ensure!(!rows.is_empty(), "it has no rows");
     Ok(rows)
+}
+
+/// The places of four columns in a head, if it has them all.
+fn columns(head: &StringRecord, names: [&str; 4]) -> Option<[usize; 4]> {
+    let found = names.map(|name| head.iter().position(|column| column == name));
+    let [Some(time), Some(x), Some(y), Some(z)] = found else { return None };
+    Some([time, x, y, z])
 }
 
 fn csv_row(

@@ -119,17 +119,8 @@ pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
         .collect::<Result<_, _>>()
         .with_context(wrong)?;
     let frame = reading.anchor.or_else(|| first_place(&rows)).map(LocalFrame::at);
-    let sample = |row: &LogRow| {
-        let mut position = match (row.place, &frame) {
-            (LogPlace::Geodetic { place, .. }, Some(frame)) => frame.local(place),
-            (LogPlace::Local(position), _) => position,
-            (LogPlace::Geodetic { .. }, None) => return None,
-        };
-        position.z -= reading.antenna_m;
-        let ahead_s = if reading.is_gps_time { GPS_AHEAD_S } else { 0.0 };
-        Some(LogSample { time_s: row.time_s - ahead_s, position })
-    };
-    let mut samples: Vec<LogSample> = rows.iter().filter_map(sample).collect();
+    let mut samples: Vec<LogSample> =
+        rows.iter().filter_map(|row| reading.sample(row, frame.as_ref())).collect();
     samples.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
     samples.dedup_by(|a, b| a.time_s == b.time_s);
     Ok(FlightLog { samples, errors: reading.errors })
@@ -170,6 +161,18 @@ impl Reading {
         let (latitude, longitude) = (place.latitude_deg(), place.longitude_deg());
         let place = Geodetic::from_degrees(latitude, longitude, place.height() + raise_m)?;
         Ok(LogRow { place: LogPlace::Geodetic { place, above: Above::Unsaid }, ..row })
+    }
+
+    /// Where the target was, by a row; `None` if it is in degrees and the site has no frame.
+    fn sample(&self, row: &LogRow, frame: Option<&LocalFrame>) -> Option<LogSample> {
+        let mut position = match (row.place, frame) {
+            (LogPlace::Geodetic { place, .. }, Some(frame)) => frame.local(place),
+            (LogPlace::Local(position), _) => position,
+            (LogPlace::Geodetic { .. }, None) => return None,
+        };
+        position.z -= self.antenna_m;
+        let ahead_s = if self.is_gps_time { GPS_AHEAD_S } else { 0.0 };
+        Some(LogSample { time_s: row.time_s - ahead_s, position })
     }
 }
 

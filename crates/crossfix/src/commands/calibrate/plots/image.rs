@@ -7,7 +7,7 @@ use crossfix_geometry::{ImageSize, Pixel};
 use nalgebra::Vector2;
 use plotters::prelude::*;
 
-use super::panel::{Area, Chart, FIRST, Failure, Words, frame, nothing};
+use super::panel::{Area, Chart, FIRST, Failure, Ranges, Words, frame, nothing};
 
 /// Number of cells of an image, across and down. With half as many each way, the mean of a cell
 /// would hide how the lens bends within it.
@@ -26,7 +26,7 @@ fn image<'a, 'b>(
     size: ImageSize,
 ) -> Result<Chart<'a, 'b>, Failure> {
     let words = Words { title, x: "px", y: "px" };
-    frame(area, &words, (0.0..f64::from(size.width), f64::from(size.height)..0.0))
+    frame(area, &words, Ranges { x: 0.0..f64::from(size.width), y: f64::from(size.height)..0.0 })
 }
 
 /// The sides of a cell, pixels.

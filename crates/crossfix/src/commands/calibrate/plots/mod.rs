@@ -15,8 +15,17 @@ use plotters::prelude::*;
 
 use panel::{Area, Failure};
 
-/// Panels of a sheet: columns and rows.
-const PANELS: (usize, usize) = (3, 2);
+/// How many panels a sheet has.
+#[derive(Clone, Copy, Debug)]
+struct Grid {
+    columns: usize,
+    rows: usize,
+}
+
+/// Panels of a flight's sheet.
+const OF_FLIGHT: Grid = Grid { columns: 3, rows: 2 };
+/// Panels of a comparison's sheet.
+const OF_COMPARISON: Grid = Grid { columns: 2, rows: 1 };
 /// Size of a panel, px.
 const PANEL_PX: (u32, u32) = (560, 400);
 
@@ -24,7 +33,7 @@ const PANEL_PX: (u32, u32) = (560, 400);
 pub fn of_flight(result: &FlightResult, folder: &Path) -> anyhow::Result<usize> {
     make(folder)?;
     for camera in &result.cameras {
-        draw(folder, &camera.name, PANELS, |panels| of_camera(camera, panels))?;
+        draw(folder, &camera.name, OF_FLIGHT, |panels| of_camera(camera, panels))?;
     }
     Ok(result.cameras.len())
 }
@@ -50,7 +59,7 @@ pub fn of_comparison(
 ) -> anyhow::Result<usize> {
     make(folder)?;
     for camera in &comparison.cameras {
-        draw(folder, &camera.name, (2, 1), |panels| compared(camera, second, panels))?;
+        draw(folder, &camera.name, OF_COMPARISON, |panels| compared(camera, second, panels))?;
     }
     Ok(comparison.cameras.len())
 }
@@ -75,17 +84,23 @@ fn make(folder: &Path) -> anyhow::Result<()> {
 fn draw(
     folder: &Path,
     camera: &CameraName,
-    (columns, rows): (usize, usize),
+    grid: Grid,
     panels: impl FnOnce(&[Area<'_>]) -> Result<(), Failure>,
 ) -> anyhow::Result<()> {
     let path = folder.join(format!("{camera}.svg"));
-    let size = (PANEL_PX.0 * columns as u32, PANEL_PX.1 * rows as u32);
-    let drawn = || -> Result<(), Failure> {
-        let area = SVGBackend::new(&path, size).into_drawing_area();
-        area.fill(&WHITE)?;
-        panels(&area.split_evenly((rows, columns)))?;
-        area.present()?;
-        Ok(())
-    };
-    drawn().map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))
+    draw_sheet(&path, grid, panels)
+        .map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))
+}
+
+fn draw_sheet(
+    path: &Path,
+    grid: Grid,
+    panels: impl FnOnce(&[Area<'_>]) -> Result<(), Failure>,
+) -> Result<(), Failure> {
+    let size = (PANEL_PX.0 * grid.columns as u32, PANEL_PX.1 * grid.rows as u32);
+    let area = SVGBackend::new(path, size).into_drawing_area();
+    area.fill(&WHITE)?;
+    panels(&area.split_evenly((grid.rows, grid.columns)))?;
+    area.present()?;
+    Ok(())
 }

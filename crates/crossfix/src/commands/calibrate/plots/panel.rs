@@ -26,18 +26,24 @@ pub struct Words<'a> {
     pub y: &'a str,
 }
 
+/// The ranges that a panel shows.
+pub struct Ranges {
+    pub x: Range<f64>,
+    pub y: Range<f64>,
+}
+
 /// A frame with axes and labels.
 pub fn frame<'a, 'b>(
     area: &'a Area<'b>,
     words: &Words<'_>,
-    (x, y): (Range<f64>, Range<f64>),
+    ranges: Ranges,
 ) -> Result<Chart<'a, 'b>, Failure> {
     let mut chart = ChartBuilder::on(area)
         .caption(&words.title, ("sans-serif", 15))
         .margin(10)
         .x_label_area_size(32)
         .y_label_area_size(48)
-        .build_cartesian_2d(x, y)?;
+        .build_cartesian_2d(ranges.x, ranges.y)?;
     chart
         .configure_mesh()
         .max_light_lines(0)

@@ -5,7 +5,7 @@ use crossfix_calibration::{CameraResult, FittedLabel};
 use plotters::prelude::*;
 
 use super::panel::{
-    Area, FIRST, Failure, SECOND, Words, curve, dots, frame, legend, nothing, span, thinned,
+    Area, FIRST, Failure, Ranges, SECOND, Words, curve, dots, frame, legend, nothing, span, thinned,
 };
 
 /// Residuals up to this many SDs are shown: larger ones belong to something else, and are counted.
@@ -35,7 +35,7 @@ pub fn over_time(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
         return nothing(area, &title, "too few labels");
     };
     let words = Words { title, x: "its own time [s]", y: "px" };
-    let mut chart = frame(area, &words, (time, -shown..shown))?;
+    let mut chart = frame(area, &words, Ranges { x: time, y: -shown..shown })?;
     for (axis, colour) in [(0, FIRST), (1, SECOND)] {
         let points = thinned(&camera.fitted).map(|label| (label.own_time_s, label.beside_px[axis]));
         dots(&mut chart, points.filter(|(_, px)| px.abs() < shown), colour)?;
@@ -47,18 +47,8 @@ pub fn over_time(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
 /// they lie across it, which no clock error explains.
 pub fn along_and_across(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
     let title = "along and across the motion, medians of 3 s".to_owned();
-    let medians = |time_of: fn(&FittedLabel, f64) -> Option<f64>| -> Vec<(f64, f64)> {
-        let moving: Vec<(f64, f64)> = camera
-            .fitted
-            .iter()
-            .filter_map(|label| {
-                Some((label.own_time_s, 1e3 * time_of(label, LEAST_MOTION_PX_PER_S)?))
-            })
-            .collect();
-        let block = |(time_s, _): &(f64, f64)| (time_s / BLOCK_S).floor();
-        moving.chunk_by(|a, b| block(a) == block(b)).filter_map(median_of).collect()
-    };
-    let (along, across) = (medians(FittedLabel::ahead_s), medians(FittedLabel::across_s));
+    let along = medians(&camera.fitted, FittedLabel::ahead_s);
+    let across = medians(&camera.fitted, FittedLabel::across_s);
     let Some(time) = span(along.iter().map(|(time_s, _)| *time_s)) else {
         return nothing(area, &title, "the target hardly moves in the image");
     };
@@ -67,12 +57,25 @@ pub fn along_and_across(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fa
     // The scale leaves out the largest fiftieth, which a turn or another object causes.
     let shown = (1.3 * sizes[(sizes.len() - 1) * 49 / 50]).max(1.0);
     let words = Words { title, x: "its own time [s]", y: "ms" };
-    let mut chart = frame(area, &words, (time, -shown..shown))?;
+    let mut chart = frame(area, &words, Ranges { x: time, y: -shown..shown })?;
     for (points, colour) in [(along, FIRST), (across, SECOND)] {
         let points = points.into_iter().filter(|(_, ms)| ms.abs() < shown);
         chart.draw_series(points.map(|at| Circle::new(at, 2, colour.filled())))?;
     }
     legend(area, ["ahead along it: a clock", "across it: no clock"])
+}
+
+/// The medians over blocks of time, ms, of what a function says of the labels that move.
+fn medians(
+    labels: &[FittedLabel],
+    time_of: fn(&FittedLabel, f64) -> Option<f64>,
+) -> Vec<(f64, f64)> {
+    let moving: Vec<(f64, f64)> = labels
+        .iter()
+        .filter_map(|label| Some((label.own_time_s, 1e3 * time_of(label, LEAST_MOTION_PX_PER_S)?)))
+        .collect();
+    let block = |(time_s, _): &(f64, f64)| (time_s / BLOCK_S).floor();
+    moving.chunk_by(|a, b| block(a) == block(b)).filter_map(median_of).collect()
 }
 
 /// The middle time and median value of a block.
@@ -102,7 +105,7 @@ pub fn histogram(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
     let normal = |x: f64| (-x * x / 2.0).exp() / std::f64::consts::TAU.sqrt();
     let most = bars.iter().copied().fold(normal(0.0), f64::max);
     let words = Words { title, x: "deviations", y: "density" };
-    let mut chart = frame(area, &words, (-SHOWN..SHOWN, 0.0..1.1 * most))?;
+    let mut chart = frame(area, &words, Ranges { x: -SHOWN..SHOWN, y: 0.0..1.1 * most })?;
     let low = |bar: usize| bar as f64 * width - SHOWN;
     chart.draw_series(bars.iter().enumerate().map(|(bar, height)| {
         Rectangle::new([(low(bar), 0.0), (low(bar + 1), *height)], FIRST.mix(0.4).filled())
@@ -138,7 +141,7 @@ pub fn autocorrelation(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fai
     let variance = squares / f64::from(count.max(1));
     let words = Words { title, x: "time between them [s]", y: "correlation" };
     let longest_s = step_s * LAGS as f64;
-    let mut chart = frame(area, &words, (0.0..longest_s, -0.3..1.0))?;
+    let mut chart = frame(area, &words, Ranges { x: 0.0..longest_s, y: -0.3..1.0 })?;
     let found = (1..LAGS)
         .filter(|lag| counts[*lag] > 0)
         .map(|lag| (lag as f64 * step_s, products[lag] / f64::from(counts[lag]) / variance));
