@@ -64,13 +64,8 @@ fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
     if let [only] = cluster {
         return vec![(only.row, only.column)];
     }
-    let places = |of: fn(&Pairing) -> usize| {
-        let mut values: Vec<usize> = cluster.iter().map(of).collect();
-        values.sort_unstable();
-        values.dedup();
-        values
-    };
-    let (rows, columns) = (places(|c| c.row), places(|c| c.column));
+    let rows = distinct(cluster.iter().map(|candidate| candidate.row));
+    let columns = distinct(cluster.iter().map(|candidate| candidate.column));
     if rows.len() * (columns.len() + rows.len()) > MOST_CELLS {
         return greedy(cluster);
     }
@@ -88,6 +83,14 @@ fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
         .filter(|&(row, column)| column < columns.len() && gains[(row, column)] > 0)
         .map(|(row, column)| (rows[row], columns[column]))
         .collect()
+}
+
+/// Indices in ascending order, each once.
+fn distinct(indices: impl Iterator<Item = usize>) -> Vec<usize> {
+    let mut indices: Vec<usize> = indices.collect();
+    indices.sort_unstable();
+    indices.dedup();
+    indices
 }
 
 fn greedy(cluster: &[Pairing]) -> Vec<(usize, usize)> {

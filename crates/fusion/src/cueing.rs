@@ -225,12 +225,12 @@ fn along_range(
     // Given the log range: mean c x / sqrt(v) at node x, covariance P - c c' / v, where c is the
     // column of the log range in P and v its variance.
     let left = covariance - tied * tied.transpose() / variance;
-    let place = |(node, weight): (f64, f64)| {
+    let places = NODES.map(|(node, weight)| {
         let point = chart.point(&(tied * (node / variance.sqrt())));
         let left = left.fixed_view::<3, 3>(0, 0);
         (weight, point.place, point.place_by * left * point.place_by.transpose())
-    };
-    NODES.map(place).to_vec()
+    });
+    places.to_vec()
 }
 
 #[cfg(test)]

@@ -231,13 +231,17 @@ impl Tracker {
     /// How well an exposure fits the confirmed tracks: the sum over the tracks of the best
     /// log-likelihood ratio, of a bearing being this track's against being clutter.
     pub(crate) fn fit(&self, exposure: &Exposure, known: &KnownCamera) -> f64 {
-        let best = |track: &Track| {
-            let expected = self.expectation(track, exposure, known)?;
-            let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
-            // ln(N / clutter), P_D left out: it is the same for both times that are compared.
-            fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
-        };
-        self.tracks.values().filter(|track| track.is_confirmed()).filter_map(best).sum()
+        let confirmed = self.tracks.values().filter(|track| track.is_confirmed());
+        confirmed.filter_map(|track| self.best_ratio(track, exposure, known)).sum()
+    }
+
+    /// The best log-likelihood ratio of a bearing being this track's; `None` without one in its
+    /// gate.
+    fn best_ratio(&self, track: &Track, exposure: &Exposure, known: &KnownCamera) -> Option<f64> {
+        let expected = self.expectation(track, exposure, known)?;
+        let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
+        // ln(N / clutter), P_D left out: it is the same for both times that are compared.
+        fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
     }
 
     /// Handles one exposure: bearings that belong to tracks update them.

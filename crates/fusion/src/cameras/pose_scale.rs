@@ -163,13 +163,13 @@ impl Cameras {
     /// The typical factor of the cameras: the median of their factors times the median of the steps
     /// that their own draws would take, both in logarithms.
     fn typical_scale(&self, samples: &[ScaleSample]) -> f64 {
-        let scales = || {
-            let of = |sample: &ScaleSample| Some(&self.get(&sample.camera)?.pose_scale);
-            samples.iter().filter_map(of)
-        };
-        let value = median(scales().map(|scale| scale.value.ln()).collect());
-        let step = median(scales().filter_map(|scale| Some(scale.own_step()?.ln())).collect());
-        (value + step).exp()
+        let scales: Vec<&PoseScale> = samples
+            .iter()
+            .filter_map(|sample| Some(&self.get(&sample.camera)?.pose_scale))
+            .collect();
+        let value = median(scales.iter().map(|scale| scale.value.ln()).collect());
+        let steps = scales.iter().filter_map(|scale| Some(scale.own_step()?.ln()));
+        (value + median(steps.collect())).exp()
     }
 
     /// For each camera, by its factor: the squared pose error that explains its part of a draw, and
@@ -191,11 +191,11 @@ impl Cameras {
         // which takes from a residual what the place has explained: REML.
         let spread = information.try_inverse()?;
         let place = spread * pull;
-        let of_camera = |(sample, weight): (&ScaleSample, &Matrix2<f64>)| {
+        let of_cameras = samples.iter().zip(&weights).map(|(sample, weight)| {
             let (found, expected) = sample.found_and_expected(weight, &place, &spread);
             (found * scale(sample), expected * scale(sample))
-        };
-        Some(samples.iter().zip(&weights).map(of_camera).collect())
+        });
+        Some(of_cameras.collect())
     }
 }
 

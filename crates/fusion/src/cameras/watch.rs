@@ -399,12 +399,11 @@ impl Meeting {
         }
         let spread = information.try_inverse()?;
         let place = spread * pull;
-        let missed = |(sample, weight): (&ScaleSample, &Matrix2<f64>)| {
+        let squares = samples.iter().zip(weights).map(|(sample, weight)| {
             let missed = sample.offset - sample.by_position * place;
             missed.dot(&(weight * missed))
-        };
-        let squares = samples.iter().zip(weights).map(missed).sum();
-        Some(Self { place, spread, squares })
+        });
+        Some(Self { place, spread, squares: squares.sum() })
     }
 }
 

@@ -98,6 +98,11 @@ impl Stream {
         if is_slow { step_s } else { 0.0 }
     }
 
+    /// Whether the camera has been behind for no longer than `bearable_s`, at `run_s`.
+    pub(super) fn keeps_up(&self, run_s: f64, bearable_s: f64) -> bool {
+        self.behind_since_s.is_none_or(|since_s| run_s - since_s <= bearable_s)
+    }
+
     /// How far behind the newest another frame may still come, s: 0 for a camera that keeps the
     /// order.
     pub(super) fn disorder_s(&self, lateness_s: f64) -> f64 {

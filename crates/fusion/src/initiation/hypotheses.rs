@@ -124,11 +124,13 @@ impl Hypothesis {
     fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
         let cameras = self.cameras();
         let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
-        let number = |camera: &CameraName| {
+        let choices = cameras.iter().map(|camera| {
             let may_stand = cameras.len() > 2 && rooted(camera) == Rooted::Yes;
-            lines.get(camera).map_or(1, |[all, others]| if may_stand { *all } else { *others })
-        };
-        let choices: f64 = cameras.iter().map(|camera| (number(camera).max(1) as f64).ln()).sum();
+            let number = lines.get(camera);
+            let number = number.map_or(1, |[all, others]| if may_stand { *all } else { *others });
+            (number.max(1) as f64).ln()
+        });
+        let choices: f64 = choices.sum();
         let moves = cameras.iter().any(|camera| rooted(camera) == Rooted::No);
         if moves { choices } else { choices + RIVAL_MARGIN }
     }
@@ -267,11 +269,11 @@ impl Hypotheses {
         let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
         // If the target is outside the camera's view, a hypothesis without a line costs nothing.
         let miss = if expected { log_missed(visible, detection) } else { 0.0 };
-        let ratio = |(i, (_, line)): (usize, &NamedLine)| {
+        let near = lines.iter().enumerate().filter_map(|(i, (_, line))| {
             let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
             Some((fit.log_ratio(visible * detection, exposure.clutter_per_sr), i))
-        };
-        let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
+        });
+        let mut near: Vec<(f64, usize)> = near.collect();
         near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         // The likeliest continuation, with a bearing or without.
         let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
@@ -367,10 +369,8 @@ impl Hypotheses {
                 .filter_map(|((camera, ..), line)| Some((camera, line, *uncertainty.get(camera)?)));
             let mut track = Box::new(Track::start(&fix, named, motion));
             track.score = seed.score;
-            let lines =
-                seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
-            let mut one_target =
-                OneTargetTest::begin(lines, fix.state.position(), self.speed, seed.score);
+            let place = fix.state.position();
+            let mut one_target = OneTargetTest::begin(&seed.lines, place, self.speed, seed.score);
             let mut rooted = BTreeMap::new();
             for ((camera, sequence, index), timed) in &seed.lines {
                 let of = |exposure: &&&Exposure| {

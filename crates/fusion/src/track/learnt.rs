@@ -181,12 +181,10 @@ impl Track {
     /// The first row of a camera that has been silent for so long that nothing is left of what was
     /// learnt of its errors.
     fn forgotten(&self, now: Timestamp) -> Option<usize> {
-        let is_forgotten = |name: &CameraName| {
-            self.ties.get(name).is_none_or(|ties| {
-                ties.silent_s(now).is_none_or(|silent_s| silent_s > FORGOTTEN * ties.lasting_s)
-            })
-        };
-        self.learnt.rows().find(|(_, name)| is_forgotten(name)).map(|(row, _)| row)
+        let mut rows = self.learnt.rows();
+        let forgotten =
+            rows.find(|(_, name)| self.ties.get(*name).is_none_or(|ties| has_forgotten(ties, now)));
+        forgotten.map(|(row, _)| row)
     }
 
     /// Stops learning the errors in these two rows.
@@ -357,20 +355,15 @@ impl Track {
     /// The part of the state's covariance that the shared errors cause, which is its lower bound.
     /// If rounding has made the learnt errors' covariance indefinite, they are reset.
     pub(super) fn shared_part(&mut self) -> Matrix6<f64> {
-        // Summed by size and not by the cameras' names, so that names decide no rounding: a nearly
-        // singular matrix magnifies it.
-        let sum = |mut parts: Vec<Matrix6<f64>>| -> Matrix6<f64> {
-            parts.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
-            parts.iter().sum()
-        };
         let of_cameras = self.ties.iter().map(|(name, ties)| self.considered_part(name, ties));
         // P >= sum of X_k X_k' for independent errors of unit variance.
-        let considered = sum(of_cameras.collect());
+        let considered = sum_by_size(of_cameras.collect());
         match self.learnt_part() {
             Some(learnt) => considered + learnt,
             None => {
                 self.forget_all();
-                sum(self.ties.values().map(|t| t.covariance * t.covariance.transpose()).collect())
+                let all = self.ties.values().map(|t| t.covariance * t.covariance.transpose());
+                sum_by_size(all.collect())
             }
         }
     }
@@ -411,4 +404,17 @@ impl Track {
         let half = own.cholesky()?.l().solve_lower_triangular(&tied.transpose())?;
         Some((half.transpose() * half).fixed_view::<6, 6>(0, 0).into_owned())
     }
+}
+
+/// Whether nothing is left of what was learnt of a camera's errors: it has been silent for too
+/// long.
+fn has_forgotten(ties: &Ties, now: Timestamp) -> bool {
+    ties.silent_s(now).is_none_or(|silent_s| silent_s > FORGOTTEN * ties.lasting_s)
+}
+
+/// The sum by size and not by the cameras' names, so that names decide no rounding: a nearly
+/// singular matrix magnifies it.
+fn sum_by_size(mut parts: Vec<Matrix6<f64>>) -> Matrix6<f64> {
+    parts.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
+    parts.iter().sum()
 }

@@ -101,11 +101,10 @@ impl Handover {
             let of =
                 Cued { track_id: 0, camera: camera.to_string(), image_track_id: one.image_track };
             let seen_from = Some(one.line.line.origin);
-            let expected = |time: Timestamp| {
+            Some(CueTarget::new(of, now, seen_from, |time| {
                 let ahead_s = time.seconds_since(one.sight.time);
                 state.predicted(ahead_s, TURNING_DENSITY * range.powi(2))
-            };
-            Some(CueTarget::new(of, now, seen_from, expected))
+            }))
         });
         known.collect()
     }
@@ -279,17 +278,14 @@ impl Handover {
     /// rivals, unless they give the same target.
     fn settle(&mut self, context: &ReadingContext<'_>) -> Vec<Start> {
         let ReadingContext { exposure, motion, .. } = *context;
-        let is_new = |reading: &Reading| {
-            let (camera, sequence, _) = &reading.newest;
-            *camera == exposure.camera && *sequence == exposure.sequence
-        };
+
         let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
         let all: Vec<&Reading> =
             self.seen.values().flatten().flat_map(|one| &one.readings).collect();
         let mut sure: Vec<&Reading> = all
             .iter()
             .copied()
-            .filter(|one| is_new(one) && one.ratio() >= MARGIN && one.track.is_placed())
+            .filter(|one| one.is_of(exposure) && one.ratio() >= MARGIN && one.track.is_placed())
             .filter(|one| {
                 // Rivals share the newest line or the direction that was followed first.
                 let mut rivals = all.iter().filter(|other| {
