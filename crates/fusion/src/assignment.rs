@@ -11,7 +11,7 @@ const STEPS: f64 = 1e6;
 /// larger one is cut greedily: time is bounded. With half of it one of more than 100 rows and as
 /// many columns, and not only of more than 141, is cut, and targets close together may get one
 /// another's bearings.
-const MOST_CELLS: usize = 40_000;
+const MAX_CELLS: usize = 40_000;
 
 /// A row and a column that may be paired, and the gain of that over leaving both alone.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -66,7 +66,7 @@ fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
     }
     let rows = distinct(cluster.iter().map(|candidate| candidate.row));
     let columns = distinct(cluster.iter().map(|candidate| candidate.column));
-    if rows.len() * (columns.len() + rows.len()) > MOST_CELLS {
+    if rows.len() * (columns.len() + rows.len()) > MAX_CELLS {
         return greedy(cluster);
     }
     // Each row also has a column of its own where it gains nothing, so that it may stay alone.

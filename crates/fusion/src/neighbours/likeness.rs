@@ -21,7 +21,7 @@ const UNLIKE: f64 = 16.3;
 const PARTED: f64 = 3.0 * UNLIKE;
 /// A squared distance counts no more than this, so that one bad update is outweighed in a second.
 /// With half of it two that part are told apart after 1.1 s and not after 0.4 s.
-const MOST: f64 = 3.0 * PARTED;
+const MAX_DISTANCE: f64 = 3.0 * PARTED;
 /// Assumed density of targets, 1/m^3: one in a cube of 100 m. With ten times as much the error has
 /// to be half as large before two tracks are one.
 const DENSITY: f64 = 1e-6;
@@ -105,7 +105,7 @@ impl Likenesses {
         }
         let Some(factor) = spread.cholesky() else { return };
         // -2 ln N(d; 0, S) = d' S^-1 d + ln det S, less a constant.
-        let distance = apart.dot(&factor.solve(&apart)).min(MOST);
+        let distance = apart.dot(&factor.solve(&apart)).min(MAX_DISTANCE);
         let cost = distance + 2.0 * factor.l().diagonal().map(f64::ln).sum();
         let new = TrackLikeness { since: now, seen: now, distance, cost };
         let known = self.0.entry(pair).or_insert(new);

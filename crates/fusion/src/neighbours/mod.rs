@@ -45,7 +45,7 @@ const COMPARED_EVERY_S: f64 = 0.1;
 const HELD_BACK_S: f64 = 2.0;
 /// Most tracks of neighbours that are kept in mind. Memory is bounded; beyond it a target that
 /// flies in has a second number here.
-const MOST_TRACKS: usize = 10_000;
+const MAX_TRACKS: usize = 10_000;
 
 /// Place of one fusion centre among those of its site.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -139,7 +139,7 @@ impl Neighbours {
                 self.theirs.remove(&said);
                 continue;
             };
-            if self.theirs.len() < MOST_TRACKS || self.theirs.contains_key(&said) {
+            if self.theirs.len() < MAX_TRACKS || self.theirs.contains_key(&said) {
                 let grip = Grip::of(track, &state);
                 // A neighbour that does not say when a track began has not said it before.
                 let began = (track.born_ns != 0).then(|| Timestamp::from_nanos(track.born_ns));
