@@ -74,9 +74,17 @@ pub(crate) struct Told {
     pub(crate) moved: Matrix6x2<f64>,
 }
 
+/// The update of one motion model.
+#[derive(Clone, Copy)]
+pub(crate) struct ModelUpdate<'a> {
+    pub(crate) after: &'a Updated,
+    /// The model's probability after the bearing.
+    pub(crate) probability: f64,
+}
+
 impl Told {
-    /// The mean over motion models with their probabilities, and the spread over them.
-    pub(crate) fn over<'a>(models: impl Iterator<Item = (&'a Updated, f64)> + Clone) -> Self {
+    /// The mean over motion models, and the spread over them.
+    pub(crate) fn over<'a>(models: impl Iterator<Item = ModelUpdate<'a>> + Clone) -> Self {
         let mut mean = Self {
             carried: Matrix6::zeros(),
             gained: SharedTies::zeros(),
@@ -88,7 +96,8 @@ impl Told {
             moved: Matrix6x2::zeros(),
         };
         let mut state = Vector6::zeros();
-        for (Updated { state: after, told, .. }, probability) in models.clone() {
+        for ModelUpdate { after: Updated { state: after, told, .. }, probability } in models.clone()
+        {
             mean.carried += told.carried * probability;
             mean.gained += told.gained * probability;
             mean.by += told.by * probability;
@@ -97,7 +106,7 @@ impl Told {
             mean.pull += told.pull * probability;
             state += after.mean * probability;
         }
-        for (Updated { state: after, told, .. }, probability) in models {
+        for ModelUpdate { after: Updated { state: after, told, .. }, probability } in models {
             let pull = told.pull - mean.pull;
             mean.pull_spread += pull * pull.transpose() * probability;
             mean.moved += (after.mean - state) * pull.transpose() * probability;

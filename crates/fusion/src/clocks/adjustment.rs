@@ -6,7 +6,7 @@ mod target;
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 use super::batch_means::BatchMeans;
-use super::curve::{Basis, Curve};
+use super::curve::{Basis, Curve, TimedPlace};
 use super::window::WindowBearing;
 use target::{PlaceShift, PlaceShifts, PredictedTarget};
 
@@ -218,7 +218,10 @@ impl<'a> Adjustment<'a> {
     /// places.
     fn begin(&self) -> Option<WindowState> {
         let cameras = self.prior.mean.clone();
-        let places = self.sights.iter().map(|sight| (self.time(sight, &cameras).0, sight.place));
+        let places = self.sights.iter().map(|sight| {
+            let (time_s, _) = self.time(sight, &cameras);
+            TimedPlace { time_s, place: sight.place }
+        });
         Some(WindowState { coefficients: self.curve.fit(places, 1.0)?, cameras })
     }
 

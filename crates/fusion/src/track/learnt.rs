@@ -14,6 +14,7 @@
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, Dyn, Matrix2, Matrix6, OMatrix, U2, U5, U6, Vector2};
 
+use super::ties::Rescaling;
 use super::{Ties, Track};
 use crate::uncertainty::{CONSIDERED, CorrelatedNoise, LASTING, SharedCovariance, SharedErrors};
 use crate::update::Told;
@@ -21,7 +22,7 @@ use crate::update::Told;
 /// Most cameras whose lasting errors a track learns, as an update's cost grows with the square of
 /// their number; the errors of the others are considered. With half as many, the velocities of a
 /// site of six cameras err by 1 % more.
-const MOST_LEARNT: usize = 8;
+const MAX_LEARNT: usize = 8;
 /// After this many decay times of an error nothing is left of what has been learnt of it (e^-5),
 /// and another camera may take its place. With half of it 8 % is thrown away.
 const FORGOTTEN: f64 = 5.0;
@@ -137,7 +138,7 @@ impl Track {
         if lasting.sd_rad <= 0.0 || !self.is_confirmed() || self.learnt.row_of(camera).is_some() {
             return;
         }
-        if self.learnt.cameras.len() == MOST_LEARNT {
+        if self.learnt.cameras.len() == MAX_LEARNT {
             let Some(row) = self.forgotten(now) else { return };
             self.forget(row);
         }
@@ -313,14 +314,14 @@ impl Track {
         between
     }
 
-    /// Passes on that `N` considered errors of a camera, from `first` on, have `ratio` times the
-    /// variance that was assumed; `scale` is the factor on their ties. What is correlated with them
-    /// changes accordingly. Returns the change of the state's covariance, (ratio - 1) X X'.
+    /// Passes on that `N` considered errors of a camera, from `first` on, have another variance
+    /// than was assumed. What is correlated with them changes accordingly. Returns the change of
+    /// the state's covariance, (ratio - 1) X X'.
     pub(super) fn rescale<const N: usize>(
         &mut self,
         camera: &CameraName,
         first: usize,
-        (ratio, scale): (f64, f64),
+        Rescaling { ratio, scale }: Rescaling,
     ) -> Option<Matrix6<f64>> {
         let ties = self.ties.get_mut(camera)?;
         let state = ties.covariance.fixed_columns::<N>(first).into_owned();
@@ -339,7 +340,7 @@ impl Track {
                 tied += state * own;
             }
         }
-        self.rescale_past::<N>(camera, first, (ratio, scale), &state);
+        self.rescale_past::<N>(camera, first, Rescaling { ratio, scale }, &state);
         Some(state * state.transpose() * (ratio - 1.0))
     }
 

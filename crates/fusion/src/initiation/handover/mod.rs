@@ -24,8 +24,8 @@ use crate::cameras::{KnownCamera, Rooted};
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::spatial::TimedLine;
-use crate::track::{Track, TrackId, TrackStatus};
-use crate::tracker::same_target;
+use crate::track::{Track, TrackStatus};
+use crate::tracker::{UsedSighting, same_target};
 use crate::{Exposure, FusionConfig};
 
 /// A reading is confirmed if one target is likelier by this log-likelihood ratio than each camera
@@ -114,12 +114,12 @@ impl Handover {
     pub(super) fn see(
         &mut self,
         exposure: &Exposure,
-        used: &[(usize, TrackId)],
+        used: &[UsedSighting],
         known: &KnownCamera,
         motion: &MotionSetup,
     ) -> Vec<Start> {
         let mut is_owned = vec![false; exposure.sightings.len()];
-        used.iter().for_each(|(index, _)| is_owned[*index] = true);
+        used.iter().for_each(|used| is_owned[used.index] = true);
         let context = ReadingContext { exposure, known, motion, is_owned: &is_owned };
         self.forget(exposure.time);
         let begun = self.follow(&context);
