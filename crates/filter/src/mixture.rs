@@ -32,9 +32,9 @@ pub fn normal_score<const N: usize>(value: f64, parts: [(f64, AxisMeasurement); 
 /// P(X > value) for sign +1 and P(X < value) for -1, times the sum of the weights.
 fn beyond(value: f64, sign: f64, parts: &[(f64, AxisMeasurement)]) -> f64 {
     // The sum of w_i erfc(z_i / sqrt 2) / 2.
-    let tail = |(weight, part): &(f64, AxisMeasurement)| {
+    let tails = parts.iter().map(|(weight, part)| {
         let off = sign * (value - part.position) / part.variance.sqrt();
         weight * 0.5 * erfc(off / std::f64::consts::SQRT_2)
-    };
-    parts.iter().map(tail).sum()
+    });
+    tails.sum()
 }

@@ -27,7 +27,7 @@ const LEAST_CAMERAS: usize = 3;
 /// The steady state begins this long after the first exposure, s.
 const WARM_S: f64 = 5.0;
 /// No case takes much longer than this, s; what is slower than that stops where it is.
-const MOST_S: f64 = 60.0;
+const MAX_S: f64 = 60.0;
 
 /// The system's allocator, counting the bytes that are held.
 struct Counting;
@@ -264,7 +264,7 @@ fn run(case: &Case) {
     let started = Instant::now();
     let mut index = 0;
     let mut data_s = 0.0;
-    while index < run.site.exposures() && started.elapsed().as_secs_f64() < MOST_S {
+    while index < run.site.exposures() && started.elapsed().as_secs_f64() < MAX_S {
         let end = (index + an_epoch).min(run.site.exposures());
         let exposures: Vec<SiteExposure> = (index..end).map(|i| run.site.exposure(i)).collect();
         run.advance(&exposures, warm_s);

@@ -11,7 +11,7 @@ const STEPS: f64 = 1e6;
 /// larger one is cut greedily: time is bounded. With half of it one of more than 100 rows and as
 /// many columns, and not only of more than 141, is cut, and targets close together may get one
 /// another's bearings.
-const MOST_CELLS: usize = 40_000;
+const MAX_CELLS: usize = 40_000;
 
 /// A row and a column that may be paired, and the gain of that over leaving both alone.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -64,14 +64,9 @@ fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
     if let [only] = cluster {
         return vec![(only.row, only.column)];
     }
-    let places = |of: fn(&Pairing) -> usize| {
-        let mut values: Vec<usize> = cluster.iter().map(of).collect();
-        values.sort_unstable();
-        values.dedup();
-        values
-    };
-    let (rows, columns) = (places(|c| c.row), places(|c| c.column));
-    if rows.len() * (columns.len() + rows.len()) > MOST_CELLS {
+    let rows = distinct(cluster.iter().map(|candidate| candidate.row));
+    let columns = distinct(cluster.iter().map(|candidate| candidate.column));
+    if rows.len() * (columns.len() + rows.len()) > MAX_CELLS {
         return greedy(cluster);
     }
     // Each row also has a column of its own where it gains nothing, so that it may stay alone.
@@ -88,6 +83,14 @@ fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
         .filter(|&(row, column)| column < columns.len() && gains[(row, column)] > 0)
         .map(|(row, column)| (rows[row], columns[column]))
         .collect()
+}
+
+/// Indices in ascending order, each once.
+fn distinct(indices: impl Iterator<Item = usize>) -> Vec<usize> {
+    let mut indices: Vec<usize> = indices.collect();
+    indices.sort_unstable();
+    indices.dedup();
+    indices
 }
 
 fn greedy(cluster: &[Pairing]) -> Vec<(usize, usize)> {

@@ -28,7 +28,7 @@ const AHEAD_S: [f64; 5] = [0.0, 0.25, 0.5, 1.0, 2.0];
 /// Most targets in one cue message: a camera looks for one at a time, and the one that it is on
 /// must be among them. With half of it a camera that is on the 17th nearest is no longer told of
 /// it.
-const MOST_CUES: usize = 32;
+const MAX_CUES: usize = 32;
 /// Nodes and weights of the five-point Gauss-Hermite rule for the mean and variance of a function
 /// of a standard normal variable: exact for polynomials up to the ninth power.
 const NODES: [(f64, f64); 5] = [
@@ -113,7 +113,7 @@ pub(crate) fn cues(
         let by_range = one.range_m.total_cmp(&other.range_m);
         is_track(other).cmp(&is_track(one)).then(by_range)
     });
-    cues.truncate(MOST_CUES);
+    cues.truncate(MAX_CUES);
     let frame =
         CueFrame { time_ns: now.nanos(), camera: camera.to_string(), cues, ..Default::default() };
     frame.stamped()
@@ -225,12 +225,12 @@ fn along_range(
     // Given the log range: mean c x / sqrt(v) at node x, covariance P - c c' / v, where c is the
     // column of the log range in P and v its variance.
     let left = covariance - tied * tied.transpose() / variance;
-    let place = |(node, weight): (f64, f64)| {
+    let places = NODES.map(|(node, weight)| {
         let point = chart.point(&(tied * (node / variance.sqrt())));
         let left = left.fixed_view::<3, 3>(0, 0);
         (weight, point.place, point.place_by * left * point.place_by.transpose())
-    };
-    NODES.map(place).to_vec()
+    });
+    places.to_vec()
 }
 
 #[cfg(test)]

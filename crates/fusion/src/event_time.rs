@@ -238,13 +238,9 @@ impl EventBuffer {
         let patience_s = PATIENCES * self.config.lateness_s;
         let is_live = |stream: &&Stream| self.run_s - stream.heard_s <= patience_s;
         let live: Vec<&Stream> = self.going_on().filter(is_live).collect();
-        let newest_first = |mut times: Vec<Timestamp>| {
-            times.sort_by(|one, other| other.cmp(one));
-            times
-        };
-        let newest = newest_first(live.iter().map(|stream| stream.newest).collect());
+        let newest = newest_first(live.iter().map(|stream| stream.newest));
         // The time that a camera has reached: its next frame is not due before.
-        let reached = newest_first(live.iter().map(|s| s.newest.plus_seconds(s.step_s)).collect());
+        let reached = newest_first(live.iter().map(|s| s.newest.plus_seconds(s.step_s)));
         let half = live.len() / 2;
         let time = match (newest.as_slice(), reached.get(half)) {
             // The second newest, but no later than what half of the cameras have reached.
@@ -322,8 +318,8 @@ impl EventBuffer {
         if let Some(dropped) = self.dropped.pop() {
             return Some(Err(dropped));
         }
-        let next = self.waiting.pop_settled(self.watermark())?;
-        Some(self.take(next))
+        let (exposure, is_compared) = self.waiting.pop_settled(self.watermark())?;
+        Some(self.take(exposure, is_compared))
     }
 
     /// The next exposure, whatever may still come.
@@ -331,26 +327,27 @@ impl EventBuffer {
         if let Some(dropped) = self.dropped.pop() {
             return Some(Err(dropped));
         }
-        let next = self.waiting.pop()?;
-        Some(self.take(next))
+        let (exposure, is_compared) = self.waiting.pop()?;
+        Some(self.take(exposure, is_compared))
     }
 
-    /// Takes an exposure out for good.
-    fn take(&mut self, (exposure, compared): (Exposure, bool)) -> Result<Exposure, Rejection> {
+    /// Takes an exposure out for good; `is_compared` is whether its time has been compared with
+    /// that of other cameras.
+    fn take(&mut self, exposure: Exposure, is_compared: bool) -> Result<Exposure, Rejection> {
         // A frame taken in before a second camera was heard may turn out to be from the future.
-        if !compared && let Some(reference) = self.reference {
+        if !is_compared && let Some(reference) = self.reference {
             let ahead = exposure.time.seconds_since(reference.time);
             if ahead > self.config.max_ahead_s {
                 return Err(exposure.refused(RejectionReason::Future { by_s: ahead }));
             }
         }
         self.released = self.released.max(exposure.time);
-        self.remember((exposure.time, exposure.camera.clone()));
+        self.remember(exposure.time, exposure.camera.clone());
         Ok(exposure)
     }
 
-    fn remember(&mut self, order: (Timestamp, CameraName)) {
-        self.taken.insert(order);
+    fn remember(&mut self, time: Timestamp, camera: CameraName) {
+        self.taken.insert((time, camera));
         let oldest = self.released.plus_seconds(-self.config.lateness_s);
         while self.taken.len() > MAX_TAKEN
             || self.taken.first().is_some_and(|(time, _)| *time < oldest)
@@ -378,18 +375,22 @@ impl EventBuffer {
             return Some(patience);
         }
         let bearable_s = PATIENCES * lateness_s;
-        let is_waited_for = |stream: &&Stream| {
-            let keeps_up =
-                stream.behind_since_s.is_none_or(|since_s| self.run_s - since_s <= bearable_s);
-            keeps_up && stream.newest > forgotten
-        };
-        let lately = self.going_on().filter(is_waited_for);
+        let lately = self
+            .going_on()
+            .filter(|stream| stream.keeps_up(self.run_s, bearable_s) && stream.newest > forgotten);
         let slowest = lately.map(|s| s.newest.plus_seconds(-s.disorder_s(lateness_s))).min();
         // Of the cameras that have ended, nothing more comes; of the others, nothing before
         // `slowest`.
         // The later of the two: a slow camera holds the others up by the lateness at most.
         Some(slowest.map_or(patience, |slowest| slowest.max(patience)))
     }
+}
+
+/// Times in order, the newest first.
+fn newest_first(times: impl Iterator<Item = Timestamp>) -> Vec<Timestamp> {
+    let mut times: Vec<Timestamp> = times.collect();
+    times.sort_by(|one, other| other.cmp(one));
+    times
 }
 
 #[cfg(test)]

@@ -28,8 +28,8 @@ use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::MotionSetup;
 use crate::site_time::{FrameDecision, SiteTime, moved};
-use crate::track::{Track, TrackId};
-use crate::tracker::{TrackChange, Tracker};
+use crate::track::Track;
+use crate::tracker::{TrackChange, Tracker, UsedSighting};
 use correcting::SaidTime;
 use smoothing::Smoothing;
 
@@ -358,13 +358,13 @@ impl Fusion {
     }
 
     /// Updates the tracks with an exposure, and gives what they leave over to the search for new
-    /// tracks; returns how the exposure fits the tracks, and which track has used which sighting
-    /// (by index).
+    /// tracks; returns how the exposure fits the tracks, and which track has used which
+    /// sighting.
     fn follow(
         &mut self,
         exposure: &Exposure,
         changes: &mut Vec<TrackChange>,
-    ) -> (Fittings, Vec<(usize, TrackId)>) {
+    ) -> (Fittings, Vec<UsedSighting>) {
         let Self { cameras, tracker, initiator, unmet, counters, .. } = self;
         let Some(known) = cameras.known(&exposure.camera) else {
             return Default::default();
@@ -392,14 +392,14 @@ impl Fusion {
     }
 
     /// Updates the estimate of the camera's clock with its bearings of tracks.
-    fn compare_clocks(&mut self, exposure: &Exposure, used: &[(usize, TrackId)]) {
+    fn compare_clocks(&mut self, exposure: &Exposure, used: &[UsedSighting]) {
         if !self.clocks.is_needed() {
             return;
         }
         self.clocks.advance(exposure.time, &self.tracker);
-        for (index, id) in used {
+        for used in used {
             if let (Some(track), Some(sighting)) =
-                (self.tracker.track(*id), exposure.sightings.get(*index))
+                (self.tracker.track(used.track), exposure.sightings.get(used.index))
             {
                 self.clocks.update(track, exposure, &sighting.line);
             }

@@ -40,10 +40,7 @@ pub(crate) fn track(
         angle_rad: residual.angle,
         nis: residual.nis,
     });
-    let weak = |quantity: Quantity| {
-        let axis = track.observability.weak_axis.filter(|axis| axis.quantity == quantity)?;
-        Some(axis.direction.into_inner().into())
-    };
+
     let mut told = crossfix_message::Track {
         id: track.id.0,
         state: state.into(),
@@ -53,12 +50,18 @@ pub(crate) fn track(
         condition_number: track.observability.condition_number,
         updated_ns: track.updated.nanos(),
         born_ns: track.born.nanos(),
-        weak_position_axis: weak(Quantity::Position),
-        weak_velocity_axis: weak(Quantity::Velocity),
+        weak_position_axis: weak_axis(track, Quantity::Position),
+        weak_velocity_axis: weak_axis(track, Quantity::Velocity),
         ..Default::default()
     };
     set_state(&mut told, &now);
     told
+}
+
+/// The axis of a quantity that cannot be observed, if the track's worst determined one is of it.
+fn weak_axis(track: &Track, quantity: Quantity) -> Option<crossfix_message::Vector3> {
+    let axis = track.observability.weak_axis.filter(|axis| axis.quantity == quantity)?;
+    Some(axis.direction.into_inner().into())
 }
 
 /// Sets a message's position, velocity and covariance.

@@ -4,7 +4,7 @@ use crossfix_filter::{
     ModeRates, MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual,
 };
 
-use crate::{FusionConfigError, Manoeuvres, Tracking};
+use crate::{FlightModel, FusionConfigError, Manoeuvres, Tracking};
 
 /// Standard deviation of a track's velocity after a manoeuvre that a detector saw, m/s per axis.
 /// With half of it a target of 15 m/s that turns back is four deviations off; with twice as much
@@ -41,12 +41,7 @@ impl MotionSetup {
         let single = MotionModels::single(config.acceleration_density);
         let (models, detector) = match config.manoeuvres {
             Manoeuvres::Models => {
-                let model = |m: &crate::FlightModel| MotionModel {
-                    density: m.acceleration_density,
-                    share: m.share,
-                    calm: m.calm,
-                };
-                let models: Vec<MotionModel> = config.models.iter().map(model).collect();
+                let models: Vec<MotionModel> = config.models.iter().map(motion_model).collect();
                 let rates = ModeRates {
                     switching_per_s: config.switching_rate_per_s,
                     calming_per_s: config.calming_rate_per_s,
@@ -90,4 +85,8 @@ impl MotionSetup {
     pub(crate) fn detector(&self) -> Option<ManoeuvreDetector> {
         self.detector.clone()
     }
+}
+
+fn motion_model(model: &FlightModel) -> MotionModel {
+    MotionModel { density: model.acceleration_density, share: model.share, calm: model.calm }
 }

@@ -9,7 +9,7 @@
 //! uncertain range is nearly Gaussian.
 
 use crossfix_filter::KinematicState;
-use crossfix_geometry::passing_ranges;
+use crossfix_geometry::{Ray, passing_ranges};
 use nalgebra::{
     Matrix2x3, Matrix3, Matrix3x2, Matrix3x6, Matrix6, Matrix6x2, Point3, Unit, Vector3, Vector6,
 };
@@ -185,8 +185,8 @@ impl RangeChart {
 
     /// The coordinate ln(r / r0) at which the sight line passes nearest to `line`.
     fn nearest_to(&self, line: &crossfix_geometry::SightLine) -> Option<f64> {
-        let [here, there] =
-            passing_ranges((self.origin, &self.direction), (line.origin, &line.direction));
+        let sight = Ray { origin: self.origin, direction: self.direction };
+        let [here, there] = passing_ranges(sight, line.ray());
         (here > 0.0 && there > 0.0).then(|| (here / self.range).ln())
     }
 }

@@ -67,11 +67,11 @@ impl ReacquisitionContext<'_> {
             * config.detection_probability;
         let open = exposure.sightings.iter().enumerate();
         let open = open.filter(|(i, _)| self.owners[*i].is_none_or(|id| id == owner));
-        let fit = |(i, sighting): (usize, &crate::Sighting)| {
+        let fits = open.filter_map(|(i, sighting)| {
             let fit = expected.fit(&sighting.line, self.gate)?;
             Some((fit.log_ratio(detection, exposure.clutter_per_sr), i))
-        };
-        let mut fits: Vec<(f64, usize)> = open.filter_map(fit).collect();
+        });
+        let mut fits: Vec<(f64, usize)> = fits.collect();
         fits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         fits
     }

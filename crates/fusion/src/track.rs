@@ -150,12 +150,20 @@ pub struct Track {
     detector: Option<ManoeuvreDetector>,
 }
 
+/// A line of the fix that a track starts from.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct StartLine<'a> {
+    pub(crate) camera: &'a CameraName,
+    /// Its covariance already includes the uncertainty of the camera.
+    pub(crate) line: &'a TimedLine,
+    pub(crate) uncertainty: CameraUncertainty,
+}
+
 impl Track {
-    /// A tentative track at a fix of these lines, each with the uncertainty of its camera; the
-    /// lines' covariances already include that uncertainty.
+    /// A tentative track at a fix of these lines.
     pub(crate) fn start<'a>(
         fix: &Fix,
-        lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine, CameraUncertainty)>,
+        lines: impl IntoIterator<Item = StartLine<'a>>,
         motion: &MotionSetup,
     ) -> Self {
         let mut track = Self {
@@ -182,8 +190,8 @@ impl Track {
             information: Matrix6::zeros(),
             detector: motion.detector(),
         };
-        for (camera, timed, uncertainty) in lines {
-            track.note_start(fix, camera, timed, &uncertainty);
+        for StartLine { camera, line, uncertainty } in lines {
+            track.note_start(fix, camera, line, &uncertainty);
         }
         // Not every solver includes in the fix's covariance all that poses and clocks can have done
         // to the fix.
@@ -199,7 +207,7 @@ impl Track {
         uncertainty: CameraUncertainty,
         motion: &MotionSetup,
     ) -> Self {
-        let mut track = Self::start(fix, [(camera, line, uncertainty)], motion);
+        let mut track = Self::start(fix, [StartLine { camera, line, uncertainty }], motion);
         // One camera alone: nothing holds the range, and what moves along the sight line is not
         // seen.
         (track.held, track.ranged, track.follower) = (false, false, Some(line.line.origin));

@@ -65,15 +65,23 @@ struct Noted {
     third_differences: Vec<ThirdDifferences>,
 }
 
+/// A sighting that a track has used.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct UsedSighting {
+    /// Its index in the exposure.
+    pub(crate) index: usize,
+    pub(crate) track: TrackId,
+}
+
 /// Result of an exposure.
 #[derive(Debug)]
 pub(crate) struct TrackerStep {
     /// The sightings that belong to no track, or to a track that only one camera supports.
     pub(crate) free: Vec<Sighting>,
-    /// Which of them (by index) such a weakly supported track has used.
-    pub(crate) claims: Vec<(usize, TrackId)>,
-    /// Which sighting (by index) updated which track.
-    pub(crate) used: Vec<(usize, TrackId)>,
+    /// Those of them that such a weakly supported track has used, by their indices among the free.
+    pub(crate) claims: Vec<UsedSighting>,
+    /// Which sighting updated which track.
+    pub(crate) used: Vec<UsedSighting>,
     /// How the exposure fits the confirmed targets that other cameras see.
     pub(crate) fittings: Fittings,
     /// What the camera's bearings of tracks show of their noise.
@@ -163,7 +171,7 @@ impl Tracker {
         &self,
         exposure: &Exposure,
         known: &KnownCamera,
-    ) -> (Fittings, Vec<(usize, TrackId)>) {
+    ) -> (Fittings, Vec<UsedSighting>) {
         let seen = self.tracks.values().filter(|track| {
             track.is_confirmed()
                 && track.others_than(&exposure.camera, &self.motion) >= 2
@@ -174,7 +182,7 @@ impl Tracker {
             let nearest = self.nearest_sighting(track, exposure, known);
             let others = track.others_than(&exposure.camera, &self.motion);
             fittings.add(others, fitting(track, exposure, known, nearest.is_some()));
-            used.extend(nearest.map(|nearest| (nearest, track.id)));
+            used.extend(nearest.map(|index| UsedSighting { index, track: track.id }));
         }
         (fittings, used)
     }
@@ -231,13 +239,17 @@ impl Tracker {
     /// How well an exposure fits the confirmed tracks: the sum over the tracks of the best
     /// log-likelihood ratio, of a bearing being this track's against being clutter.
     pub(crate) fn fit(&self, exposure: &Exposure, known: &KnownCamera) -> f64 {
-        let best = |track: &Track| {
-            let expected = self.expectation(track, exposure, known)?;
-            let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
-            // ln(N / clutter), P_D left out: it is the same for both times that are compared.
-            fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
-        };
-        self.tracks.values().filter(|track| track.is_confirmed()).filter_map(best).sum()
+        let confirmed = self.tracks.values().filter(|track| track.is_confirmed());
+        confirmed.filter_map(|track| self.best_ratio(track, exposure, known)).sum()
+    }
+
+    /// The best log-likelihood ratio of a bearing being this track's; `None` without one in its
+    /// gate.
+    fn best_ratio(&self, track: &Track, exposure: &Exposure, known: &KnownCamera) -> Option<f64> {
+        let expected = self.expectation(track, exposure, known)?;
+        let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
+        // ln(N / clutter), P_D left out: it is the same for both times that are compared.
+        fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
     }
 
     /// Handles one exposure: bearings that belong to tracks update them.
@@ -257,8 +269,11 @@ impl Tracker {
         }
         let Noted { mut changes, fittings, third_differences } = noted;
         self.reacquire(exposure, known, &mut owners);
-        let used =
-            owners.iter().enumerate().filter_map(|(i, owner)| Some((i, (*owner)?))).collect();
+        let used = owners
+            .iter()
+            .enumerate()
+            .filter_map(|(index, owner)| Some(UsedSighting { index, track: (*owner)? }))
+            .collect();
         let unassigned = owners.iter().filter(|owner| owner.is_none()).count();
         let (mut free, mut claims) = (Vec::new(), Vec::new());
         for (sighting, owner) in exposure.sightings.iter().zip(owners) {
@@ -266,7 +281,7 @@ impl Tracker {
             // free: if the other cameras see the target elsewhere, it must be found again.
             let weak = owner.filter(|id| self.tracks.get(id).is_some_and(|track| !track.is_held()));
             if owner.is_none() || weak.is_some() {
-                claims.extend(weak.map(|id| (free.len(), id)));
+                claims.extend(weak.map(|track| UsedSighting { index: free.len(), track }));
                 free.push(sighting.clone());
             }
         }

@@ -165,6 +165,14 @@ impl PairResult {
             Self::Lines(Passing::Close) => Some(PairFinding::Close),
         }
     }
+
+    /// By how much the lines miss each other, m, if they do.
+    fn miss_m(&self) -> Option<f64> {
+        match self {
+            Self::Lines(Passing::Apart { by_m }) => Some(*by_m),
+            _ => None,
+        }
+    }
 }
 
 /// What one camera has seen lately.
@@ -197,11 +205,7 @@ impl PairComparisons {
 
     /// The median distance at which the lines miss each other, m.
     fn median_miss(&self) -> Option<f64> {
-        let miss = |shown: &PairResult| match shown {
-            PairResult::Lines(Passing::Apart { by_m }) => Some(*by_m),
-            _ => None,
-        };
-        let mut misses: Vec<f64> = self.shown.iter().filter_map(miss).collect();
+        let mut misses: Vec<f64> = self.shown.iter().filter_map(PairResult::miss_m).collect();
         misses.sort_by(f64::total_cmp);
         misses.get(misses.len() / 2).copied()
     }
@@ -346,11 +350,15 @@ fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> Pair
         return PairResult::Together;
     }
     let all = one.iter().flat_map(|first| other.iter().map(|second| passings.of(first, second)));
-    let closeness = |passing: &Passing| match passing {
+    let closest = all.min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)));
+    closest.map_or(PairResult::Nothing, PairResult::Lines)
+}
+
+/// How far apart two lines count as passing each other, m.
+fn distance_m(passing: &Passing) -> f64 {
+    match passing {
         Passing::Close => f64::NEG_INFINITY,
         Passing::Apart { by_m } => *by_m,
         Passing::Nowhere => f64::INFINITY,
-    };
-    let closest = all.min_by(|a, b| closeness(a).total_cmp(&closeness(b)));
-    closest.map_or(PairResult::Nothing, PairResult::Lines)
+    }
 }

@@ -74,9 +74,17 @@ pub(crate) struct Told {
     pub(crate) moved: Matrix6x2<f64>,
 }
 
+/// The update of one motion model.
+#[derive(Clone, Copy)]
+pub(crate) struct ModelUpdate<'a> {
+    pub(crate) after: &'a Updated,
+    /// The model's probability after the bearing.
+    pub(crate) probability: f64,
+}
+
 impl Told {
-    /// The mean over motion models with their probabilities, and the spread over them.
-    pub(crate) fn over<'a>(models: impl Iterator<Item = (&'a Updated, f64)> + Clone) -> Self {
+    /// The mean over motion models, and the spread over them.
+    pub(crate) fn over<'a>(models: impl Iterator<Item = ModelUpdate<'a>> + Clone) -> Self {
         let mut mean = Self {
             carried: Matrix6::zeros(),
             gained: SharedTies::zeros(),
@@ -88,7 +96,8 @@ impl Told {
             moved: Matrix6x2::zeros(),
         };
         let mut state = Vector6::zeros();
-        for (Updated { state: after, told, .. }, probability) in models.clone() {
+        for ModelUpdate { after: Updated { state: after, told, .. }, probability } in models.clone()
+        {
             mean.carried += told.carried * probability;
             mean.gained += told.gained * probability;
             mean.by += told.by * probability;
@@ -97,7 +106,7 @@ impl Told {
             mean.pull += told.pull * probability;
             state += after.mean * probability;
         }
-        for (Updated { state: after, told, .. }, probability) in models {
+        for ModelUpdate { after: Updated { state: after, told, .. }, probability } in models {
             let pull = told.pull - mean.pull;
             mean.pull_spread += pull * pull.transpose() * probability;
             mean.moved += (after.mean - state) * pull.transpose() * probability;
@@ -159,6 +168,47 @@ impl Linearised {
             range: model.range,
         })
     }
+
+    /// The update that has come to these coordinates by this gain, with the prior covariance in the
+    /// chart's coordinates. `None` if the numbers fail.
+    fn updated(
+        &self,
+        chart: &StateChart,
+        coordinates: &Vector6<f64>,
+        covariance: &Matrix6<f64>,
+        gain: Matrix6x2<f64>,
+    ) -> Option<Updated> {
+        let Self { innovation, across, inverse, determinant, by, shifts, .. } = *self;
+        // Only rounding can make it negative, where S is nearly singular.
+        let nis = innovation.dot(&(inverse * innovation)).max(0.0);
+        let point = chart.point(coordinates);
+        // P <- P - K S K', and back to position and velocity.
+        let (covariance, carried, gain) =
+            chart.from(&point, covariance - gain * across.transpose(), &by, gain);
+        let state = KinematicState {
+            mean: point.mean(),
+            covariance: (covariance + covariance.transpose()) / 2.0,
+        };
+        // If the prior range was uncertain by kilometres, rounding may leave a covariance that is
+        // not positive definite.
+        let positive = state.covariance.cholesky().is_some();
+        (positive && state.is_finite() && nis.is_finite()).then(|| Updated {
+            state,
+            nis,
+            // ln N(z; 0, S) in two dimensions: -(z' S^-1 z + ln((2 pi)^2 |S|)) / 2.
+            log_likelihood: -(nis + (4.0 * PI.powi(2) * determinant).ln()) / 2.0,
+            told: Told {
+                carried,
+                gained: gain * shifts,
+                by: by * chart.place_by_state(),
+                shifts,
+                weight: inverse,
+                pull: inverse * innovation,
+                pull_spread: Matrix2::zeros(),
+                moved: Matrix6x2::zeros(),
+            },
+        })
+    }
 }
 
 /// The state updated by a bearing of the same time. `seen_from` is the position of the camera that
@@ -194,36 +244,7 @@ pub(crate) fn updated(
         if !(is_own || settled || round == MAX_ROUNDS) {
             continue;
         }
-        let Linearised { innovation, across, inverse, determinant, by, shifts, .. } = seen;
-        // Only rounding can make it negative, where S is nearly singular.
-        let nis = innovation.dot(&(inverse * innovation)).max(0.0);
-        let point = chart.point(&coordinates);
-        // P <- P - K S K', and back to position and velocity.
-        let (covariance, carried, gain) =
-            chart.from(&point, covariance - gain * across.transpose(), &by, gain);
-        let state = KinematicState {
-            mean: point.mean(),
-            covariance: (covariance + covariance.transpose()) / 2.0,
-        };
-        // If the prior range was uncertain by kilometres, rounding may leave a covariance that is
-        // not positive definite.
-        let positive = state.covariance.cholesky().is_some();
-        return (positive && state.is_finite() && nis.is_finite()).then(|| Updated {
-            state,
-            nis,
-            // ln N(z; 0, S) in two dimensions: -(z' S^-1 z + ln((2 pi)^2 |S|)) / 2.
-            log_likelihood: -(nis + (4.0 * PI.powi(2) * determinant).ln()) / 2.0,
-            told: Told {
-                carried,
-                gained: gain * shifts,
-                by: by * chart.place_by_state(),
-                shifts,
-                weight: inverse,
-                pull: inverse * innovation,
-                pull_spread: Matrix2::zeros(),
-                moved: Matrix6x2::zeros(),
-            },
-        });
+        return seen.updated(&chart, &coordinates, &covariance, gain);
     }
     None
 }

@@ -189,7 +189,8 @@ fn a_camera_worse_than_it_says_counts_less() {
 /// along each axis.
 fn wrongly_posed(
     eye: &Eye,
-    (rotation_sd, position_sd): (f64, f64),
+    rotation_sd: f64,
+    position_sd: f64,
     rng: &mut ChaCha8Rng,
 ) -> CameraCalibration {
     let mut normal = |sd: f64| Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(rng) }) * sd;
@@ -208,7 +209,7 @@ fn nees_with_wrong_poses(runs: u32, rotation_sd: f64, position_sd: f64) -> f64 {
         let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
         let mut rng = ChaCha8Rng::seed_from_u64(u64::from(run));
         for eye in &scene.eyes {
-            let message = wrongly_posed(eye, (rotation_sd, position_sd), &mut rng);
+            let message = wrongly_posed(eye, rotation_sd, position_sd, &mut rng);
             fusion.calibrate(&message.with_pose_sd(rotation_sd, position_sd)).unwrap();
         }
         sum += last_nees(&mut fusion, &scene.frames(1000 + u64::from(run)), &scene.paths[0]);
@@ -306,7 +307,7 @@ fn where_half_of_the_cameras_see_something_steadily_beside_a_target_the_poses_ar
         let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
         for eye in &scene.eyes {
             // A metre off along each axis, and nobody says so.
-            fusion.calibrate(&wrongly_posed(eye, (0.0, 1.0), &mut rng)).unwrap();
+            fusion.calibrate(&wrongly_posed(eye, 0.0, 1.0, &mut rng)).unwrap();
         }
         for frame in scene.frames(seed) {
             fusion.ingest(&frame);

@@ -22,7 +22,7 @@ use paths::{
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use tally::{Clock, Tally, random_clocks};
+use tally::{Clock, PoseSd, Tally, random_clocks};
 
 /// Flights before three cameras, two of which have random clocks.
 fn flown(paths: fn() -> Vec<Path>, rate_hz: f64, flights: u64) -> Tally {
@@ -201,7 +201,7 @@ fn a_straight_flight_in_sight_for_a_minute_teaches_them_as_well_as_its_bearings_
         assert_honest(&tally);
         assert_near_the_bound(
             &tally,
-            bound(&scene, &random_clocks(&["b", "c"], 0), (0.0, 0.0), Way::Straight),
+            bound(&scene, &random_clocks(&["b", "c"], 0), PoseSd::default(), Way::Straight),
         );
         assert_there(&tally);
     }
@@ -339,7 +339,7 @@ fn cases(rate_hz: f64) -> Vec<Case> {
         [(10.0, 1.0), (15.0, 1.0), (20.0, 1.0), (10.0, 3.0), (15.0, 3.0), (20.0, 3.0)]
     {
         let scene = a_minute_in_sight(speed, farther, rate_hz);
-        let bound_ms = 1e3 * bound(&scene, &two(0), (0.0, 0.0), Way::Straight);
+        let bound_ms = 1e3 * bound(&scene, &two(0), PoseSd::default(), Way::Straight);
         let distance = 150.0 * farther;
         cases.push((
             format!("minute at {speed} m/s, {distance} m, {rate_hz} Hz (bound {bound_ms:.2} ms)"),

@@ -50,7 +50,7 @@ fn confirmed_over_time(fusion: &mut Fusion, frames: &[BearingFrame]) -> Vec<usiz
 
 /// Ghosts and looks, where each camera sees fifteen targets that the two others do not, 675 pairs
 /// of lines; the poses are known to so much, rad and m.
-fn ghosts_of_strangers((rotation_sd, position_sd): (f64, f64)) -> (usize, usize) {
+fn ghosts_of_strangers(rotation_sd: f64, position_sd: f64) -> (usize, usize) {
     let eyes = quick_site();
     let (mut epochs, mut ghosts) = (0, 0);
     for seed in 0..4 {
@@ -80,10 +80,10 @@ fn ghosts_of_strangers((rotation_sd, position_sd): (f64, f64)) -> (usize, usize)
 
 #[test]
 fn targets_that_one_camera_each_sees_make_next_to_no_tracks() {
-    let (ghosts, epochs) = ghosts_of_strangers((0.0, 0.0));
+    let (ghosts, epochs) = ghosts_of_strangers(0.0, 0.0);
     // Before lines were held against each camera's own: 308 in 60.
     assert!(ghosts * 2 <= epochs, "{ghosts} ghosts in {epochs} epochs");
-    let (ghosts, epochs) = ghosts_of_strangers((1e-3, 0.05));
+    let (ghosts, epochs) = ghosts_of_strangers(1e-3, 0.05);
     // Lines that pass each other by the poses' 30 cm cross as true ones do. Before a shift counted
     // once: 1299 in 60.
     assert!(ghosts <= epochs * 2, "{ghosts} ghosts in {epochs} epochs");

@@ -86,31 +86,43 @@ pub struct SightLine {
 /// nearest at a range beyond all use. With half of it the same: on a base of 100 m it is 3000 km.
 const PARALLEL: f64 = 1e-9;
 
-/// The ranges (m) along two rays at which they pass nearest to each other. Each ray is given by its
-/// origin and direction; a range is negative where that point is behind the origin.
+/// A straight line from a point on, without an uncertainty.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ray {
+    /// Where it begins, metres.
+    pub origin: Point3<f64>,
+    /// Where it goes.
+    pub direction: Unit<Vector3<f64>>,
+}
+
+/// The ranges (m) along two rays at which they pass nearest to each other; a range is negative
+/// where that point is behind the origin.
 ///
 /// ```
-/// use crossfix_geometry::passing_ranges;
+/// use crossfix_geometry::{Ray, passing_ranges};
 /// use nalgebra::{Point3, Vector3};
-/// let north = (Point3::origin(), &Vector3::y_axis());
-/// let west = (Point3::new(30.0, 40.0, 1.0), &-Vector3::x_axis());
+/// let north = Ray { origin: Point3::origin(), direction: Vector3::y_axis() };
+/// let west = Ray { origin: Point3::new(30.0, 40.0, 1.0), direction: -Vector3::x_axis() };
 /// let [along_north, along_west] = passing_ranges(north, west);
 /// assert!((along_north - 40.0).abs() < 1e-9 && (along_west - 30.0).abs() < 1e-9);
 /// ```
-pub fn passing_ranges(
-    (origin, u): (Point3<f64>, &Unit<Vector3<f64>>),
-    (other_origin, v): (Point3<f64>, &Unit<Vector3<f64>>),
-) -> [f64; 2] {
+pub fn passing_ranges(one: Ray, other: Ray) -> [f64; 2] {
+    let (u, v) = (one.direction, other.direction);
     // Minimises |s u - t v - b|^2 over the ranges s and t, with the base line b and c = u.v:
     // s = (u.b - c v.b) / (1 - c^2), t = (c u.b - v.b) / (1 - c^2).
-    let base = other_origin - origin;
-    let cosine = u.dot(v);
+    let base = other.origin - one.origin;
+    let cosine = u.dot(&v);
     let sine_squared = (1.0 - cosine * cosine).max(PARALLEL);
     let (along_u, along_v) = (u.dot(&base), v.dot(&base));
     [along_u - cosine * along_v, cosine * along_u - along_v].map(|range| range / sine_squared)
 }
 
 impl SightLine {
+    /// The ray itself.
+    pub fn ray(&self) -> Ray {
+        Ray { origin: self.origin, direction: self.direction }
+    }
+
     /// The distance of a point from the ray, metres; the distance from the origin if the point lies
     /// behind it.
     pub fn miss_distance(&self, point: Point3<f64>) -> f64 {

@@ -231,16 +231,23 @@ impl CameraModel {
     /// Jacobian of the projection along the tangents at a direction, pixels per radian, by central
     /// differences (relative error about 1e-9).
     fn pixels_per_radian(&self, direction: &Unit<Vector3<f64>>) -> Option<Matrix2<f64>> {
+        let by_first = self.pixels_along(direction, Vector2::x())?;
+        let by_second = self.pixels_along(direction, Vector2::y())?;
+        Some(Matrix2::from_columns(&[by_first, by_second]))
+    }
+
+    /// The column of that Jacobian for an axis of the tangents.
+    fn pixels_along(
+        &self,
+        direction: &Unit<Vector3<f64>>,
+        axis: Vector2<f64>,
+    ) -> Option<Vector2<f64>> {
         // rad: the difference's error grows with its square, that of rounding with its inverse.
         const STEP: f64 = 1e-5;
         let basis = tangent_basis(direction);
-        let at = |offset: Vector2<f64>| self.project(&(direction.into_inner() + basis * offset));
-        let column = |axis: Vector2<f64>| {
-            let ahead = at(axis * STEP)?;
-            let behind = at(axis * -STEP)?;
-            Some((ahead.0 - behind.0) / (2.0 * STEP))
-        };
-        Some(Matrix2::from_columns(&[column(Vector2::x())?, column(Vector2::y())?]))
+        let ahead = self.project(&(direction.into_inner() + basis * (axis * STEP)))?;
+        let behind = self.project(&(direction.into_inner() + basis * (axis * -STEP)))?;
+        Some((ahead.0 - behind.0) / (2.0 * STEP))
     }
 }
 

@@ -31,14 +31,9 @@ impl Geodetic {
         longitude_deg: f64,
         height_m: f64,
     ) -> Result<Self, GeometryError> {
-        let check = |what, value: f64, most: f64, must| {
-            // A NaN is in no range.
-            let good = (-most..=most).contains(&value);
-            if good { Ok(()) } else { Err(GeometryError::Geodetic { what, value, must }) }
-        };
-        check("the latitude", latitude_deg, 90.0, "from -90 to 90 degrees")?;
-        check("the longitude", longitude_deg, 180.0, "from -180 to 180 degrees")?;
-        check("the height", height_m, 1e5, "at most 100 km from the ellipsoid")?;
+        check_range("the latitude", latitude_deg, 90.0, "from -90 to 90 degrees")?;
+        check_range("the longitude", longitude_deg, 180.0, "from -180 to 180 degrees")?;
+        check_range("the height", height_m, 1e5, "at most 100 km from the ellipsoid")?;
         Ok(Self {
             latitude: latitude_deg.to_radians(),
             longitude: longitude_deg.to_radians(),
@@ -108,6 +103,18 @@ impl Geodetic {
         let height = from_axis * cos + point.z * sin - surface;
         Self { latitude, longitude: point.y.atan2(point.x), height }
     }
+}
+
+/// A number of a place, refused unless it is at most `most` from zero.
+fn check_range(
+    what: &'static str,
+    value: f64,
+    most: f64,
+    must: &'static str,
+) -> Result<(), GeometryError> {
+    // A NaN is in no range.
+    let good = (-most..=most).contains(&value);
+    if good { Ok(()) } else { Err(GeometryError::Geodetic { what, value, must }) }
 }
 
 /// The site's world frame on the Earth: local east, north, up at an anchor.

@@ -34,7 +34,7 @@ mod pan_tilt;
 mod pose;
 mod scanning;
 
-pub use bearing::{Bearing, SightLine, passing_ranges, tangent_basis};
+pub use bearing::{Bearing, Ray, SightLine, passing_ranges, tangent_basis};
 pub use camera::{Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, PixelCovariance};
 pub use error::GeometryError;
 pub use geodetic::{Geodetic, LocalFrame};

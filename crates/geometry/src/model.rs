@@ -88,15 +88,24 @@ mod tests {
 
     use super::*;
 
+    /// A target's motion.
+    struct Motion {
+        place: Point3<f64>,
+        velocity: Vector3<f64>,
+    }
+
+    /// By what a camera's statements are wrong.
+    struct Misstated {
+        /// Rotation, then position.
+        pose: Vector6<f64>,
+        ahead_s: f64,
+    }
+
     /// What a camera measures, placed in the world by the pose and the time that it states.
-    fn measured(
-        origin: Point3<f64>,
-        (place, velocity): (Point3<f64>, Vector3<f64>),
-        (pose_error, ahead_s): (Vector6<f64>, f64),
-    ) -> SightLine {
-        let turned = Rotation3::new(pose_error.fixed_rows::<3>(0).into_owned());
-        let true_origin = origin + pose_error.fixed_rows::<3>(3);
-        let seen_at = place - velocity * ahead_s;
+    fn measured(origin: Point3<f64>, target: &Motion, error: &Misstated) -> SightLine {
+        let turned = Rotation3::new(error.pose.fixed_rows::<3>(0).into_owned());
+        let true_origin = origin + error.pose.fixed_rows::<3>(3);
+        let seen_at = target.place - target.velocity * error.ahead_s;
         let direction = Unit::new_normalize(turned.inverse() * (seen_at - true_origin));
         let basis = tangent_basis(&direction);
         SightLine { origin, direction, basis, covariance: Matrix2::identity() }
@@ -118,7 +127,8 @@ mod tests {
             let (moved, error) = (Vector3::from(moved) * step, Vector6::from(error) * step);
             let ahead = ahead * step;
             let model = BearingModel::new(origin, place).unwrap();
-            let line = measured(origin, (place + moved, velocity), (error, ahead));
+            let target = Motion { place: place + moved, velocity };
+            let line = measured(origin, &target, &Misstated { pose: error, ahead_s: ahead });
             let offset = model.offset(&line).unwrap();
             let expected = model.by_position() * moved
                 + model.by_pose() * error

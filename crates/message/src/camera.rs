@@ -94,6 +94,16 @@ pub enum CalibrationError {
     },
 }
 
+impl CalibrationError {
+    fn shape(camera: &CameraName, part: &'static str) -> Self {
+        Self::Shape { camera: camera.clone(), part }
+    }
+
+    fn geometry(camera: &CameraName, source: GeometryError) -> Self {
+        Self::Geometry { camera: camera.clone(), source }
+    }
+}
+
 impl CameraCalibration {
     /// The message for a camera; its hash is filled in.
     pub fn new(name: &CameraName, camera: &Camera, valid_from: Timestamp) -> Self {
@@ -136,65 +146,80 @@ impl CameraCalibration {
     /// [`CalibrationError`] naming the camera and the part.
     pub fn parse(&self) -> Result<Calibration, CalibrationError> {
         let name: CameraName = self.camera.parse().map_err(CalibrationError::Name)?;
-        let shape = |part| CalibrationError::Shape { camera: name.clone(), part };
-        let geometry = |source| CalibrationError::Geometry { camera: name.clone(), source };
-
         let intrinsics = self.lens(&name)?;
-        let read_pose = |rotation: &[f64], position: Option<Vector3>| {
-            let rotation: [f64; 9] = rotation.try_into().map_err(|_| shape("rotation"))?;
-            let position = position.ok_or_else(|| shape("position"))?;
-            Pose::new(Matrix3::from_row_slice(&rotation), position.into()).map_err(geometry)
-        };
-        let is_bare = self.rotation.is_empty() && self.position.is_none();
-        let mount = match &self.mount {
-            None => None,
-            // A fixed pose and one that turns contradict each other.
-            Some(_) if !is_bare => return Err(shape("mount")),
-            Some(mount) => {
-                let rest = read_pose(&mount.rotation, mount.position)?;
-                Some(mount.read(rest).map_err(geometry)?)
-            }
-        };
+        let mount = self.parse_mount(&name)?;
         let pose = match &mount {
             Some(mount) => *mount.rest(),
-            None if is_bare => return Err(CalibrationError::NoPose { camera: name }),
-            None => read_pose(&self.rotation, self.position)?,
+            None if self.is_bare() => return Err(CalibrationError::NoPose { camera: name }),
+            None => parse_pose(&name, &self.rotation, self.position)?,
         };
-        let camera = Camera::new(intrinsics, pose).map_err(geometry)?;
-        let pose_covariance = match self.pose_covariance.as_slice() {
-            [] => None,
-            values => {
-                let values = values.try_into().map_err(|_| shape("pose_covariance"))?;
-                let covariance = read_pose_covariance(values, &camera);
-                Some(
-                    covariance
-                        .ok_or_else(|| CalibrationError::Covariance { camera: name.clone() })?,
-                )
-            }
-        };
-        let valid_from = Timestamp::from_nanos(self.valid_from_ns);
-        let noise = LastingNoise { sd_rad: self.lasting_noise_rad, time_s: self.lasting_noise_s };
-        let is_noise = (0.0..1.0).contains(&noise.sd_rad) && (0.0..1e6).contains(&noise.time_s);
-        if !is_noise {
-            return Err(shape("lasting_noise"));
-        }
+        let camera = Camera::new(intrinsics, pose)
+            .map_err(|source| CalibrationError::geometry(&name, source))?;
+        let pose_covariance = self.parse_pose_covariance(&name, &camera)?;
+        let lasting_noise = self.parse_noise(&name)?;
         if !(0.0..1.0).contains(&self.clock_wander_s) {
-            return Err(shape("clock_wander_s"));
+            return Err(CalibrationError::shape(&name, "clock_wander_s"));
         }
-        let datum = self.datum.as_ref().map(|datum| datum.parse().ok_or_else(|| shape("datum")));
+        let datum = self
+            .datum
+            .as_ref()
+            .map(|datum| datum.parse().ok_or_else(|| CalibrationError::shape(&name, "datum")));
         let datum = datum.transpose()?;
-        let lasts = noise.sd_rad > 0.0 && noise.time_s > 0.0;
         Ok(Calibration {
             name,
             camera,
             mount,
             takes_cues: self.takes_cues,
             pose_covariance,
-            lasting_noise: lasts.then_some(noise),
+            lasting_noise,
             clock_wander_s: self.clock_wander_s,
             datum,
-            valid_from,
+            valid_from: Timestamp::from_nanos(self.valid_from_ns),
         })
+    }
+
+    /// Whether it has no fixed pose.
+    fn is_bare(&self) -> bool {
+        self.rotation.is_empty() && self.position.is_none()
+    }
+
+    /// The mount, if the camera stands on one.
+    fn parse_mount(&self, name: &CameraName) -> Result<Option<PanTilt>, CalibrationError> {
+        let Some(mount) = &self.mount else { return Ok(None) };
+        // A fixed pose and one that turns contradict each other.
+        if !self.is_bare() {
+            return Err(CalibrationError::shape(name, "mount"));
+        }
+        let rest = parse_pose(name, &mount.rotation, mount.position)?;
+        let mount = mount.read(rest).map_err(|source| CalibrationError::geometry(name, source))?;
+        Ok(Some(mount))
+    }
+
+    /// The covariance of the camera's pose in the world's axes; `None`: exact.
+    fn parse_pose_covariance(
+        &self,
+        name: &CameraName,
+        camera: &Camera,
+    ) -> Result<Option<Matrix6<f64>>, CalibrationError> {
+        if self.pose_covariance.is_empty() {
+            return Ok(None);
+        }
+        let values = self.pose_covariance.as_slice().try_into();
+        let values = values.map_err(|_| CalibrationError::shape(name, "pose_covariance"))?;
+        let covariance = read_pose_covariance(values, camera)
+            .ok_or_else(|| CalibrationError::Covariance { camera: name.clone() })?;
+        Ok(Some(covariance))
+    }
+
+    /// The correlated part of the bearings' noise; `None`: it is white.
+    fn parse_noise(&self, name: &CameraName) -> Result<Option<LastingNoise>, CalibrationError> {
+        let noise = LastingNoise { sd_rad: self.lasting_noise_rad, time_s: self.lasting_noise_s };
+        let is_noise = (0.0..1.0).contains(&noise.sd_rad) && (0.0..1e6).contains(&noise.time_s);
+        if !is_noise {
+            return Err(CalibrationError::shape(name, "lasting_noise"));
+        }
+        let lasts = noise.sd_rad > 0.0 && noise.time_s > 0.0;
+        Ok(lasts.then_some(noise))
     }
 
     /// The same calibration for a camera on a mount: its pose is that of the mount with both angles
@@ -229,7 +254,7 @@ impl CameraCalibration {
     /// # Errors
     /// [`CalibrationError::Shape`] where the coefficients are too few or too many.
     pub fn lens(&self, name: &CameraName) -> Result<Intrinsics, CalibrationError> {
-        let shape = || CalibrationError::Shape { camera: name.clone(), part: "distortion" };
+        let shape = || CalibrationError::shape(name, "distortion");
         let distortion = match self.distortion_model() {
             DistortionModel::Unspecified | DistortionModel::None => Distortion::None,
             DistortionModel::BrownConrady => Distortion::BrownConrady(
@@ -354,6 +379,19 @@ impl PanTiltMount {
             [self.elevation_min, self.elevation_max],
         )
     }
+}
+
+/// A pose from a rotation `world_from_camera`, row by row, and a position.
+fn parse_pose(
+    name: &CameraName,
+    rotation: &[f64],
+    position: Option<Vector3>,
+) -> Result<Pose, CalibrationError> {
+    let rotation: [f64; 9] =
+        rotation.try_into().map_err(|_| CalibrationError::shape(name, "rotation"))?;
+    let position = position.ok_or_else(|| CalibrationError::shape(name, "position"))?;
+    Pose::new(Matrix3::from_row_slice(&rotation), position.into())
+        .map_err(|source| CalibrationError::geometry(name, source))
 }
 
 /// The covariance on the wire (rotation about the camera's axes) transformed to the world's axes;

@@ -129,27 +129,31 @@ impl Key {
     pub fn of_all_centres(site: &SiteName, kind: &str) -> String {
         format!("crossfix/{site}/{FUSION}/**/{kind}")
     }
+
+    /// Writes the end of the key of a fusion centre's channel.
+    fn write_of_centre(&self, f: &mut fmt::Formatter<'_>, kind: &str) -> fmt::Result {
+        match &self.area {
+            None => write!(f, "{FUSION}/{kind}"),
+            Some(area) => write!(f, "{FUSION}/{area}/{kind}"),
+        }
+    }
 }
 
 impl fmt::Display for Key {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "crossfix/{}/", self.site)?;
-        let centre = |f: &mut fmt::Formatter<'_>, kind: &str| match &self.area {
-            None => write!(f, "{FUSION}/{kind}"),
-            Some(area) => write!(f, "{FUSION}/{area}/{kind}"),
-        };
         match &self.channel {
             Channel::Bearings(camera) => write!(f, "{camera}/bearings"),
             Channel::Calibration(camera) => write!(f, "{camera}/calibration"),
             Channel::Preview(camera) => write!(f, "{camera}/preview"),
             Channel::CameraHealth(camera) => write!(f, "{camera}/health"),
             Channel::Alive(camera) => write!(f, "{camera}/alive"),
-            Channel::Tracks => centre(f, "tracks"),
-            Channel::Smoothed => centre(f, "smoothed"),
-            Channel::Events => centre(f, "events"),
-            Channel::Cues => centre(f, "cues"),
-            Channel::FusionHealth => centre(f, "health"),
-            Channel::FusionAlive => centre(f, "alive"),
+            Channel::Tracks => self.write_of_centre(f, "tracks"),
+            Channel::Smoothed => self.write_of_centre(f, "smoothed"),
+            Channel::Events => self.write_of_centre(f, "events"),
+            Channel::Cues => self.write_of_centre(f, "cues"),
+            Channel::FusionHealth => self.write_of_centre(f, "health"),
+            Channel::FusionAlive => self.write_of_centre(f, "alive"),
             Channel::Truth => write!(f, "{TRUTH}/states"),
             Channel::RecorderHealth => write!(f, "{RECORDER}/health"),
             Channel::RecorderAlive => write!(f, "{RECORDER}/alive"),

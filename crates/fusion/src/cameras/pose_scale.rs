@@ -30,17 +30,17 @@ const LARGEST_STEP: f64 = 2.5;
 /// A draw counts as no more than this many times its expectation: a target whose bearings were
 /// mixed up with another's for a moment must not be remembered for ten draws. With half of it the
 /// first draw after a knock raises the factor to 1.5 times at most, and not to twice.
-const MOST_OF_A_DRAW: f64 = 30.0;
+const MAX_DRAW_RATIO: f64 = 30.0;
 /// Least factor (variance) on a careful survey's pose covariance: a microradian, which keeps
 /// covariances regular. With ten microradians tracks seen from kilometres away claimed to know half
 /// of what they did.
-const LEAST: f64 = 1e-6;
+const LEAST_SCALE: f64 = 1e-6;
 /// Largest factor (variance): a pose that is worse is no pose. On a careful survey's milliradian it
 /// is a radian. With half of it the same.
-const MOST: f64 = 1e6;
+const MAX_SCALE: f64 = 1e6;
 /// Largest factor (variance) on a pose that is declared. With half of it a camera that errs by
 /// twice what it declares is taken to err by 1.4 times that, and draws targets towards its lines.
-const DECLARED_MOST: f64 = 4.0;
+const MAX_DECLARED_SCALE: f64 = 4.0;
 /// A camera whose pose nobody has declared, and whose errors are more than this many times
 /// (variance) those of a careful survey, is doubted. With half of it one that errs by more than 2.1
 /// deviations is, and not only by more than 3.
@@ -89,7 +89,8 @@ impl PoseScale {
     /// For a camera whose pose's deviation somebody has declared, or not, and of which nothing is
     /// learnt yet.
     pub(super) fn new(is_declared: bool) -> Self {
-        let (least, greatest) = if is_declared { (1.0, DECLARED_MOST) } else { (LEAST, MOST) };
+        let (least, greatest) =
+            if is_declared { (1.0, MAX_DECLARED_SCALE) } else { (LEAST_SCALE, MAX_SCALE) };
         Self { value: 1.0, told: 1.0, least, greatest, draws: 0.0, found: 0.0, expected: 0.0 }
     }
 
@@ -118,7 +119,7 @@ impl PoseScale {
         self.draws += 1.0;
         let share = self.draws.recip().max(DRAW_SHARE);
         // No one draw says that a camera is far worse than it was.
-        let found = found.min(expected * MOST_OF_A_DRAW);
+        let found = found.min(expected * MAX_DRAW_RATIO);
         self.found += (found - self.found) * share;
         self.expected += (expected - self.expected) * share;
         // Minorisation-maximisation step of a variance (the mode of its logarithm) with an inverse
@@ -132,7 +133,7 @@ impl PoseScale {
         // hides the pose error, inversely to the factor where the pose error is all. The root is
         // between the two. Compared under the old factor one error would count ten times; the
         // factor of a declared pose is bounded, and real flights are better for counting it so.
-        if self.greatest > DECLARED_MOST {
+        if self.greatest > MAX_DECLARED_SCALE {
             self.found /= (next / self.value).max(1.0).sqrt();
         }
         self.value = next;
@@ -163,13 +164,13 @@ impl Cameras {
     /// The typical factor of the cameras: the median of their factors times the median of the steps
     /// that their own draws would take, both in logarithms.
     fn typical_scale(&self, samples: &[ScaleSample]) -> f64 {
-        let scales = || {
-            let of = |sample: &ScaleSample| Some(&self.get(&sample.camera)?.pose_scale);
-            samples.iter().filter_map(of)
-        };
-        let value = median(scales().map(|scale| scale.value.ln()).collect());
-        let step = median(scales().filter_map(|scale| Some(scale.own_step()?.ln())).collect());
-        (value + step).exp()
+        let scales: Vec<&PoseScale> = samples
+            .iter()
+            .filter_map(|sample| Some(&self.get(&sample.camera)?.pose_scale))
+            .collect();
+        let value = median(scales.iter().map(|scale| scale.value.ln()).collect());
+        let steps = scales.iter().filter_map(|scale| Some(scale.own_step()?.ln()));
+        (value + median(steps.collect())).exp()
     }
 
     /// For each camera, by its factor: the squared pose error that explains its part of a draw, and
@@ -191,11 +192,11 @@ impl Cameras {
         // which takes from a residual what the place has explained: REML.
         let spread = information.try_inverse()?;
         let place = spread * pull;
-        let of_camera = |(sample, weight): (&ScaleSample, &Matrix2<f64>)| {
+        let of_cameras = samples.iter().zip(&weights).map(|(sample, weight)| {
             let (found, expected) = sample.found_and_expected(weight, &place, &spread);
             (found * scale(sample), expected * scale(sample))
-        };
-        Some(samples.iter().zip(&weights).map(of_camera).collect())
+        });
+        Some(of_cameras.collect())
     }
 }
 

@@ -7,12 +7,15 @@
 //! this camera alone, the lines become many times more likely. The estimated errors correct
 //! nothing; a new calibration does.
 
+mod memory;
+
 use std::collections::BTreeMap;
 
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Matrix6, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix2, Matrix3, Matrix6, SMatrix, SVector, Vector3};
 
 use super::{Cameras, ScaleSample};
+use memory::{ErrorEstimate, Memory};
 
 /// Time constants of the memories, s in which targets are seen: a camera was moved that long ago,
 /// or longer, each as likely. A large turn shows in the shorter time, while most of the longer one
@@ -46,9 +49,6 @@ const SURE: f64 = 6.9;
 /// (logarithm): one in a hundred. With half of it one that is ten times less likely is cleared.
 const DISTINCT: f64 = 4.6;
 
-/// Information on errors, in units of their own deviations, that is next to none. With half of it
-/// the same.
-const UNSEEN: f64 = 1e-9;
 /// Fewer cameras do not check one another: an error in the plane of two sight lines shows in
 /// neither.
 const LEAST_TOGETHER: usize = 3;
@@ -88,61 +88,6 @@ pub(super) struct ErrorWatch {
     cameras: Vec<Watched>,
     memories: [Memory; MEMORIES_S.len()],
     drawn: Option<Timestamp>,
-}
-
-/// What the lines have said lately about all cameras' errors.
-#[derive(Clone, Debug, Default)]
-struct Memory {
-    /// Fisher information on the errors, each in units of its own deviation.
-    information: DMatrix<f64>,
-    /// Product of the information with the estimate of the errors.
-    pull: DVector<f64>,
-}
-
-impl Memory {
-    /// Enlarges to this many errors.
-    fn widen(&mut self, errors: usize) {
-        self.information.resize_mut(errors, errors, 0.0);
-        self.pull.resize_vertically_mut(errors, 0.0);
-    }
-
-    /// Forgets `count` errors from `first` on, which are other errors from now on. The information
-    /// on all others becomes what it is if these may have been anything (the Schur complement).
-    fn forget(&mut self, first: usize, count: usize) {
-        let own = self.information.view((first, first), (count, count)).into_owned();
-        let own_pull = self.pull.rows(first, count).into_owned();
-        let mut ties = self.information.columns(first, count).into_owned();
-        // Some of them may not have been seen at all.
-        let least = DMatrix::identity(count, count) * UNSEEN;
-        // I <- I - T I_ff^-1 T', and the same for the pull.
-        if let Some(factor) = (own + least).cholesky() {
-            self.information -= &ties * factor.solve(&ties.transpose());
-            self.pull -= &ties * factor.solve(&own_pull);
-        } else {
-            self.information.fill(0.0);
-            self.pull.fill(0.0);
-        }
-        ties.fill(0.0);
-        self.information.columns_mut(first, count).copy_from(&ties);
-        self.information.rows_mut(first, count).copy_from(&ties.transpose());
-        self.pull.rows_mut(first, count).fill(0.0);
-    }
-
-    /// Removes a camera, whose errors begin at `first`.
-    fn remove(&mut self, first: usize) {
-        self.forget(first, ERRORS);
-        let information = std::mem::take(&mut self.information);
-        self.information = information.remove_rows(first, ERRORS).remove_columns(first, ERRORS);
-        self.pull = std::mem::take(&mut self.pull).remove_rows(first, ERRORS);
-    }
-
-    /// Mean and covariance of the errors if no camera has been moved: their prior has unit
-    /// variance.
-    fn estimate(&self) -> Option<(DVector<f64>, DMatrix<f64>)> {
-        let size = self.pull.len();
-        let factor = (&self.information + DMatrix::identity(size, size)).cholesky()?;
-        Some((factor.solve(&self.pull), factor.inverse()))
-    }
 }
 
 #[derive(Clone, Debug)]
@@ -196,15 +141,11 @@ impl Watched {
         Some(inverse)
     }
 
-    /// What the lines say of it, from the means and covariances of all errors if nothing has been
-    /// moved; its own errors begin at `first`.
-    fn found(
-        &self,
-        estimates: &[(DVector<f64>, DMatrix<f64>)],
-        first: usize,
-    ) -> Option<PoseFinding> {
+    /// What the lines say of it, from the estimates of all errors if nothing has been moved; its
+    /// own errors begin at `first`.
+    fn found(&self, estimates: &[ErrorEstimate], first: usize) -> Option<PoseFinding> {
         let mut each = Vec::with_capacity(KNOCKS_RAD.len() * estimates.len());
-        for (mean, covariance) in estimates {
+        for ErrorEstimate { mean, covariance } in estimates {
             let mean = mean.fixed_rows::<ERRORS>(first).into_owned();
             let own = covariance.fixed_view::<ERRORS, ERRORS>(first, first).into_owned();
             for knock_rad in KNOCKS_RAD {
@@ -399,12 +340,11 @@ impl Meeting {
         }
         let spread = information.try_inverse()?;
         let place = spread * pull;
-        let missed = |(sample, weight): (&ScaleSample, &Matrix2<f64>)| {
+        let squares = samples.iter().zip(weights).map(|(sample, weight)| {
             let missed = sample.offset - sample.by_position * place;
             missed.dot(&(weight * missed))
-        };
-        let squares = samples.iter().zip(weights).map(missed).sum();
-        Some(Self { place, spread, squares })
+        });
+        Some(Self { place, spread, squares: squares.sum() })
     }
 }
 

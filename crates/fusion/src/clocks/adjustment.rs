@@ -1,11 +1,14 @@
 //! Adjustment of a window: fits the target's trajectory, the clocks and the poses to its bearings
 //! together.
 
+mod target;
+
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 use super::batch_means::BatchMeans;
-use super::curve::{Basis, Curve};
+use super::curve::{Basis, Curve, TimedPlace};
 use super::window::WindowBearing;
+use target::{PlaceShift, PlaceShifts, PredictedTarget};
 
 /// Squared Mahalanobis distance (two degrees of freedom) beyond which a bearing pulls no harder, in
 /// the first descent, when all may be far off. With half of it one in ten of the target's own pulls
@@ -78,17 +81,6 @@ pub(super) struct ClockAndPosePrior {
 struct WindowState {
     coefficients: DVector<f64>,
     cameras: DVector<f64>,
-}
-
-/// A bearing's target at a state, as a camera with the stated pose would see it: its place, and the
-/// shift of that place by each component of the cameras' errors.
-#[derive(Clone, Debug)]
-struct PredictedTarget {
-    basis: Basis,
-    place: Vector3<f64>,
-    shifts: [(usize, Vector3<f64>); 8],
-    /// How many of `shifts` are set.
-    count: usize,
 }
 
 /// Minus twice the log posterior density at a state, up to a constant, with half its gradient and
@@ -226,7 +218,10 @@ impl<'a> Adjustment<'a> {
     /// places.
     fn begin(&self) -> Option<WindowState> {
         let cameras = self.prior.mean.clone();
-        let places = self.sights.iter().map(|sight| (self.time(sight, &cameras).0, sight.place));
+        let places = self.sights.iter().map(|sight| {
+            let (time_s, _) = self.time(sight, &cameras);
+            TimedPlace { time_s, place: sight.place }
+        });
         Some(WindowState { coefficients: self.curve.fit(places, 1.0)?, cameras })
     }
 
@@ -248,15 +243,10 @@ impl<'a> Adjustment<'a> {
         // p(t - o - d t'): dp/do = -v, dp/dd = -v t', with t' the time since the epoch.
         let (mut place, velocity) = basis.at(&state.coefficients);
         let Unknowns { clock, pose } = self.prior.cameras[sight.camera];
-        let mut shifts = [(0, Vector3::zeros()); 8];
-        let mut count = 0;
-        let mut add = |component: usize, shift: Vector3<f64>| {
-            shifts[count] = (component, shift);
-            count += 1;
-        };
+        let mut shifts = PlaceShifts::default();
         if let Some(first) = clock {
-            add(first, -velocity);
-            add(first + 1, -velocity * since);
+            shifts.add(first, -velocity);
+            shifts.add(first + 1, -velocity * since);
         }
         if let Some(first) = pose {
             let away = place - sight.line.origin.coords;
@@ -264,13 +254,13 @@ impl<'a> Adjustment<'a> {
                 let unit = Vector3::ith(axis, 1.0);
                 // d (x) away = sum over the axes of d_i (e_i x away), to first order in the turn.
                 let turned = unit.cross(&away);
-                add(first + axis, turned);
-                add(first + 3 + axis, unit);
+                shifts.add(first + axis, turned);
+                shifts.add(first + 3 + axis, unit);
                 place +=
                     turned * state.cameras[first + axis] + unit * state.cameras[first + 3 + axis];
             }
         }
-        PredictedTarget { basis, place, shifts, count }
+        PredictedTarget { basis, place, shifts }
     }
 
     /// Climbs to the jerk density of the greatest evidence; returns its state, density and
@@ -469,7 +459,7 @@ impl Quadratic {
         weight: f64,
     ) {
         let (pull, information) = (seen.pull * weight, seen.information * weight);
-        let shifts = &target.shifts[..target.count];
+        let shifts = target.shifts.all();
         let Basis { first, place, .. } = target.basis;
         // The place is the sum of four coefficients, each times its weight a: J = [a1 I .. a4 I].
         for (i, a) in place.iter().enumerate() {
@@ -480,20 +470,20 @@ impl Quadratic {
                 let mut block = self.information.fixed_view_mut::<3, 3>(row, 3 * (first + k));
                 block += information * (a * b);
             }
-            for (component, shift) in shifts {
-                let tied = information * shift * *a;
+            for PlaceShift { component, by } in shifts {
+                let tied = information * by * *a;
                 let mut beside = self.information.fixed_view_mut::<3, 1>(row, points + component);
                 beside += tied;
                 let mut below = self.information.fixed_view_mut::<1, 3>(points + component, row);
                 below += tied.transpose();
             }
         }
-        // Each error of the camera moves the place by its `shift`: the cameras' columns of J.
-        for (one, shift) in shifts {
-            self.gradient[points + one] += shift.dot(&pull);
-            let told = information * shift;
-            for (other, shift) in shifts {
-                self.information[(points + one, points + other)] += told.dot(shift);
+        // Each error of the camera moves the place by its shift: the cameras' columns of J.
+        for PlaceShift { component: one, by } in shifts {
+            self.gradient[points + one] += by.dot(&pull);
+            let told = information * by;
+            for PlaceShift { component: other, by } in shifts {
+                self.information[(points + one, points + other)] += told.dot(by);
             }
         }
     }

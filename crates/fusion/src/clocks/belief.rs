@@ -377,12 +377,11 @@ impl Belief {
 
     /// Recomputes each clock's share in the common time, from the offsets now.
     fn settle(&mut self) {
-        let clocks = self.cameras.values();
-        let stands = |clock: &ClockEntry| ClockReading {
+        let readings = self.cameras.values().map(|clock| ClockReading {
             offset: self.relative(clock, 0, 0.0),
             variance: clock.prior,
-        };
-        self.common = common_time(&clocks.map(stands).collect::<Vec<_>>());
+        });
+        self.common = common_time(&readings.collect::<Vec<_>>());
     }
 
     /// The clocks, each with its share in the common time.

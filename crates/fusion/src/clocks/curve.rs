@@ -37,6 +37,13 @@ pub(super) struct Basis {
     pub(super) velocity: [f64; 4],
 }
 
+/// Where something was at a time.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TimedPlace {
+    pub(super) time_s: f64,
+    pub(super) place: Vector3<f64>,
+}
+
 impl Curve {
     /// A curve from one time to another, s.
     pub(super) fn over(start_s: f64, end_s: f64) -> Self {
@@ -95,17 +102,17 @@ impl Curve {
         3.0 * (self.points() - THIRD.len() + 1) as f64 * jerk_density.ln()
     }
 
-    /// Least-squares coefficients for places at times, all with this standard deviation, m.
+    /// Least-squares coefficients for places, all with this standard deviation, m.
     pub(super) fn fit(
         &self,
-        places: impl Iterator<Item = (f64, Vector3<f64>)>,
+        places: impl Iterator<Item = TimedPlace>,
         sd_m: f64,
     ) -> Option<DVector<f64>> {
         let n = 3 * self.points();
         let mut information = DMatrix::zeros(n, n);
         let mut pull = DVector::zeros(n);
         // The normal equations A'A c = A'p of p(t) = sum of w_i(t) c_i, weighted by 1 / sd^2.
-        for (time_s, place) in places {
+        for TimedPlace { time_s, place } in places {
             let Basis { first, place: weights, .. } = self.basis(time_s);
             for i in 0..4 {
                 for axis in 0..3 {
@@ -159,7 +166,8 @@ mod tests {
     fn a_parabola_is_followed_exactly_inside_and_beyond() {
         let curve = Curve::over(-1.0, 3.0);
         let at = |t: f64| Vector3::new(1.0 + 10.0 * t, -t * t, 40.0);
-        let places = (0..40).map(|k| (-1.0 + 0.1 * f64::from(k), at(-1.0 + 0.1 * f64::from(k))));
+        let times = (0..40).map(|k| -1.0 + 0.1 * f64::from(k));
+        let places = times.map(|time_s| TimedPlace { time_s, place: at(time_s) });
         let coefficients = curve.fit(places, 1e-3).unwrap();
         for t in [-1.2, -0.3, 0.77, 3.1] {
             let (place, velocity) = curve.basis(t).at(&coefficients);

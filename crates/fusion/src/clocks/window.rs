@@ -228,13 +228,13 @@ impl TrackWindow {
     /// The window without the cameras that have given too few bearings to be checked.
     pub(super) fn checked(&self) -> Self {
         let kept = self.checked_indices();
-        let moved = |sight: &WindowBearing| {
+        let sights = self.sights.iter().filter_map(|sight| {
             let camera = kept.iter().position(|index| *index == sight.camera)?;
             Some(WindowBearing { camera, ..sight.clone() })
-        };
+        });
         Self {
             cameras: self.checked_cameras(),
-            sights: self.sights.iter().filter_map(moved).collect(),
+            sights: sights.collect(),
             offered: kept.iter().map(|index| self.offered[*index]).collect(),
             white: kept.iter().map(|index| self.white[*index]).collect(),
             ..*self

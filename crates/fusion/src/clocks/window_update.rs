@@ -171,12 +171,12 @@ impl JumpTest<'_> {
         let factors: Vec<f64> = self.known.iter().enumerate().map(of_camera).collect();
         let logarithms = factors.iter().map(|factor| factor.ln());
         let typical = (logarithms.sum::<f64>() / factors.len() as f64).exp();
-        let at_least = |(index, factor): (usize, &f64)| {
+        let at_least = factors.iter().enumerate().map(|(index, factor)| {
             let last = shown.last();
             let left = last.map_or(1.0, |fit| window.repetition(index, fit.scales[index]));
             factor.max(typical).max(left)
-        };
-        factors.iter().enumerate().map(at_least).collect()
+        });
+        at_least.collect()
     }
 
     fn learnt(&self, mut belief: Belief, adjusted: &AdjustedCameras) -> Belief {
@@ -268,15 +268,10 @@ impl JumpTest<'_> {
 
     /// The cameras of the window whose clocks may have jumped, the least fitting first.
     fn suspects(&self, adjusted: Option<&AdjustedCameras>) -> Vec<&CameraName> {
-        let strange = |index: usize| {
-            adjusted.map_or(0.0, |adjusted| {
-                adjusted.scales[index] + MAX_SCALE * adjusted.outlier_shares[index]
-            })
-        };
         let cameras = self.window.cameras.iter().enumerate();
         let mut suspects: Vec<(f64, &CameraName)> = cameras
             .filter(|(_, camera)| self.belief.is_uncertain(camera))
-            .map(|(index, camera)| (strange(index), camera))
+            .map(|(index, camera)| (adjusted.map_or(0.0, |fit| misfit(fit, index)), camera))
             .collect();
         suspects.sort_by(|a, b| b.0.total_cmp(&a.0));
         suspects.into_iter().take(MAX_SUSPECTS).map(|(_, camera)| camera).collect()
@@ -285,12 +280,34 @@ impl JumpTest<'_> {
 
 /// State components of a window's cameras: for each those of its clock, then those of its pose.
 fn components(belief: &Belief, window: &TrackWindow) -> Vec<usize> {
-    let of_camera = |camera: &CameraName| {
+    let components = window.cameras.iter().flat_map(|camera| {
         let clock = belief.index(camera).map(|index| index..index + 2);
         let pose = belief.pose(camera).map(|index| index..index + 6);
         clock.into_iter().chain(pose).flatten()
-    };
-    window.cameras.iter().flat_map(of_camera).collect()
+    });
+    components.collect()
+}
+
+/// Where among these [`components`] the unknowns of each camera of a window are.
+fn unknowns(belief: &Belief, window: &TrackWindow) -> Vec<Unknowns> {
+    let mut next = 0;
+    let unknowns = window.cameras.iter().map(|camera| Unknowns {
+        clock: belief.index(camera).map(|_| take_places(&mut next, 2)),
+        pose: belief.pose(camera).map(|_| take_places(&mut next, 6)),
+    });
+    unknowns.collect()
+}
+
+/// Takes `count` places from the next free one on; returns the first of them.
+fn take_places(next: &mut usize, count: usize) -> usize {
+    let first = *next;
+    *next += count;
+    first
+}
+
+/// How badly a camera's bearings fit.
+fn misfit(adjusted: &AdjustedCameras, index: usize) -> f64 {
+    adjusted.scales[index] + MAX_SCALE * adjusted.outlier_shares[index]
 }
 
 fn fits(adjusted: &AdjustedCameras) -> bool {
@@ -316,17 +333,7 @@ fn adjust(
     inflations: &[f64],
 ) -> Option<AdjustedCameras> {
     let (mean, covariance) = belief.marginal(components);
-    let mut next = 0;
-    let mut room = |place: Option<usize>, size: usize| {
-        let first = place.map(|_| next);
-        next += first.map_or(0, |_| size);
-        first
-    };
-    let unknowns = |camera: &CameraName| Unknowns {
-        clock: room(belief.index(camera), 2),
-        pose: room(belief.pose(camera), 6),
-    };
-    let cameras: Vec<Unknowns> = window.cameras.iter().map(unknowns).collect();
+    let cameras = unknowns(belief, window);
     let sd = |place: usize| covariance[(place, place)].max(0.0).sqrt();
     // The curve covers the bearings' times with every clock off by two deviations.
     let widest = cameras.iter().filter_map(|unknowns| unknowns.clock).map(sd).fold(0.0, f64::max);

@@ -9,7 +9,7 @@ const DISORDER_LASTS: f64 = 20.0;
 
 /// After this many frames in a row far behind its newest, a camera's clock is taken to have been
 /// ahead, even where these frames come too late. With one, a single stray frame sets its time back.
-const MOST_FAR_BEHIND: u32 = 3;
+const MAX_FAR_BEHIND: u32 = 3;
 
 /// What a camera says of a time further back than this, s, it has not held back: its clock has gone
 /// back. With half of it a host that stood still for half a minute and says the newest first is
@@ -74,8 +74,7 @@ impl Stream {
             if late_s.is_some() || known_s > 0.0 {
                 self.disorder = Some((behind_s.max(known_s), self.newest));
             }
-        } else if far_behind >= MOST_FAR_BEHIND || late_s.is_none_or(|late_s| late_s <= lateness_s)
-        {
+        } else if far_behind >= MAX_FAR_BEHIND || late_s.is_none_or(|late_s| late_s <= lateness_s) {
             // No network reorders so far: the clock was ahead, and now it is not.
             let trusted = self.trusted;
             let went_back = self.went_back || behind_s > LONGEST_BACKLOG_S;
@@ -96,6 +95,11 @@ impl Stream {
         // right.
         let is_slow = self.went_back || self.made_up_s > LONGEST_BACKLOG_S;
         if is_slow { step_s } else { 0.0 }
+    }
+
+    /// Whether the camera has been behind for no longer than `bearable_s`, at `run_s`.
+    pub(super) fn keeps_up(&self, run_s: f64, bearable_s: f64) -> bool {
+        self.behind_since_s.is_none_or(|since_s| run_s - since_s <= bearable_s)
     }
 
     /// How far behind the newest another frame may still come, s: 0 for a camera that keeps the

@@ -84,11 +84,15 @@ impl Fusion {
     /// not if the bearings fit the tracks at the times without the step, and not at the times with
     /// it.
     fn has_stepped(&self, frames: &[BearingFrame], step_s: f64) -> bool {
-        let fit = |ahead_s: f64| -> f64 {
-            // Sum of the log-likelihood ratios, with `ahead_s` taken off the frames' times.
-            frames.iter().filter_map(|frame| self.fit_of_frame(&moved(frame, -ahead_s))).sum()
-        };
-        step_s < 0.0 || (step_s < LONGEST_FORWARD_S && fit(step_s) > fit(0.0) + STEP_MARGIN)
+        step_s < 0.0
+            || (step_s < LONGEST_FORWARD_S
+                && self.fit_of(frames, step_s) > self.fit_of(frames, 0.0) + STEP_MARGIN)
+    }
+
+    /// How well frames fit the tracks with `ahead_s` taken off their times: the sum of the
+    /// log-likelihood ratios.
+    fn fit_of(&self, frames: &[BearingFrame], ahead_s: f64) -> f64 {
+        frames.iter().filter_map(|frame| self.fit_of_frame(&moved(frame, -ahead_s))).sum()
     }
 
     /// How well a frame fits the tracks; `None` if it would be refused.

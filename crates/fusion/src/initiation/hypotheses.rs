@@ -8,14 +8,14 @@ use crossfix_message::{CameraName, Solver, Timestamp};
 
 use super::one_target::{Mobility, OneTargetTest};
 use super::seeds::{Seed, SeedFinder};
-use super::selection::Selection;
+use super::selection::{PeriodLine, ScoredLines, Selection};
 use super::{NamedLine, Start, lines_of};
 use crate::cameras::Rooted;
 use crate::cameras::{Cameras, KnownCamera};
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
-use crate::track::{Track, TrackBearing, TrackExpectation, TrackId, TrackStatus};
-use crate::tracker::same_target;
+use crate::track::{StartLine, Track, TrackBearing, TrackExpectation, TrackId, TrackStatus};
+use crate::tracker::{UsedSighting, same_target};
 use crate::uncertainty::CameraUncertainty;
 use crate::visibility::log_missed;
 use crate::{Exposure, FusionConfig, Tracking};
@@ -55,8 +55,8 @@ struct Hypothesis {
     tree: u64,
     /// Boxed, as hypotheses are sorted often.
     track: Box<Track>,
-    /// Its lines of the last periods, each with the number of its period, in order of time.
-    lines: Vec<(u64, LineId)>,
+    /// Its lines of the last periods, in order of time.
+    lines: Vec<PeriodLine>,
     /// Whether each camera's newest line is of something that stands in its view.
     rooted: BTreeMap<CameraName, Rooted>,
     /// Number of periods that gave it a line.
@@ -97,7 +97,7 @@ pub(super) struct Hypotheses {
 impl Hypothesis {
     /// The cameras that have given it a line in the last periods.
     fn cameras(&self) -> BTreeSet<&CameraName> {
-        self.lines.iter().map(|(_, (camera, ..))| camera).collect()
+        self.lines.iter().map(|line| &line.id.0).collect()
     }
 
     /// Whether what stands in the cameras' views explains it: but for one camera at most, whose
@@ -124,17 +124,19 @@ impl Hypothesis {
     fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
         let cameras = self.cameras();
         let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
-        let number = |camera: &CameraName| {
+        let choices = cameras.iter().map(|camera| {
             let may_stand = cameras.len() > 2 && rooted(camera) == Rooted::Yes;
-            lines.get(camera).map_or(1, |[all, others]| if may_stand { *all } else { *others })
-        };
-        let choices: f64 = cameras.iter().map(|camera| (number(camera).max(1) as f64).ln()).sum();
+            let number = lines.get(camera);
+            let number = number.map_or(1, |[all, others]| if may_stand { *all } else { *others });
+            (number.max(1) as f64).ln()
+        });
+        let choices: f64 = choices.sum();
         let moves = cameras.iter().any(|camera| rooted(camera) == Rooted::No);
         if moves { choices } else { choices + RIVAL_MARGIN }
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {
-        self.lines.iter().filter(|(p, _)| *p == period).map(|(_, id)| id).collect()
+        self.lines.iter().filter(|line| line.period == period).map(|line| &line.id).collect()
     }
 }
 
@@ -171,9 +173,9 @@ impl Hypotheses {
         }
     }
 
-    /// Notes which lines of an exposure (by index) a track that only one camera supports has used.
-    pub(super) fn claim(&mut self, exposure: &Exposure, claims: &[(usize, TrackId)]) {
-        for &(index, track) in claims {
+    /// Notes which lines of an exposure a track that only one camera supports has used.
+    pub(super) fn claim(&mut self, exposure: &Exposure, claims: &[UsedSighting]) {
+        for &UsedSighting { index, track } in claims {
             self.claims.insert((exposure.camera.clone(), exposure.sequence, index), track);
         }
     }
@@ -195,8 +197,8 @@ impl Hypotheses {
         let span = self.span;
         for hypothesis in &mut self.hypotheses {
             let period = self.period;
-            hypothesis.lines.retain(|(p, _)| p + span > period);
-            if hypothesis.lines.last().is_some_and(|(p, _)| *p == period) {
+            hypothesis.lines.retain(|line| line.period + span > period);
+            if hypothesis.lines.last().is_some_and(|line| line.period == period) {
                 hypothesis.periods += 1;
             }
         }
@@ -267,11 +269,11 @@ impl Hypotheses {
         let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
         // If the target is outside the camera's view, a hypothesis without a line costs nothing.
         let miss = if expected { log_missed(visible, detection) } else { 0.0 };
-        let ratio = |(i, (_, line)): (usize, &NamedLine)| {
+        let near = lines.iter().enumerate().filter_map(|(i, (_, line))| {
             let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
             Some((fit.log_ratio(visible * detection, exposure.clutter_per_sr), i))
-        };
-        let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
+        });
+        let mut near: Vec<(f64, usize)> = near.collect();
         near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         // The likeliest continuation, with a bearing or without.
         let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
@@ -314,7 +316,7 @@ impl Hypotheses {
             let mobility = Mobility { density, speed: self.speed };
             hypothesis.one_target.see(&bearing, prediction, mobility, ratio);
         }
-        hypothesis.lines.push((self.period, id.clone()));
+        hypothesis.lines.push(PeriodLine { period: self.period, id: id.clone() });
         hypothesis.rooted.insert(exposure.camera.clone(), exposure.sightings[index].rooted);
         Some(hypothesis)
     }
@@ -361,16 +363,13 @@ impl Hypotheses {
             // confirmed.
             let observability = Observability::unexamined(6);
             let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
-            let named = seed
-                .lines
-                .iter()
-                .filter_map(|((camera, ..), line)| Some((camera, line, *uncertainty.get(camera)?)));
+            let named = seed.lines.iter().filter_map(|((camera, ..), line)| {
+                Some(StartLine { camera, line, uncertainty: *uncertainty.get(camera)? })
+            });
             let mut track = Box::new(Track::start(&fix, named, motion));
             track.score = seed.score;
-            let lines =
-                seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
-            let mut one_target =
-                OneTargetTest::begin(lines, fix.state.position(), self.speed, seed.score);
+            let place = fix.state.position();
+            let mut one_target = OneTargetTest::begin(&seed.lines, place, self.speed, seed.score);
             let mut rooted = BTreeMap::new();
             for ((camera, sequence, index), timed) in &seed.lines {
                 let of = |exposure: &&&Exposure| {
@@ -389,11 +388,12 @@ impl Hypotheses {
                     one_target.begin_shift(camera, &own.line, &prediction);
                 }
             }
-            let lines = seed.lines.iter().map(|(id, _)| (self.period, id.clone())).collect();
+            let period = self.period;
+            let lines = seed.lines.into_iter().map(|(id, _)| PeriodLine { period, id });
             self.hypotheses.push(Hypothesis {
                 tree: self.trees,
                 track,
-                lines,
+                lines: lines.collect(),
                 rooted,
                 periods: 1,
                 born: time,
@@ -429,7 +429,7 @@ impl Hypotheses {
     ) -> Vec<Start> {
         // Sorted by score: the rest have scores of 0 and less, which are never chosen.
         let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
-        let scored = likely.map(|h| (h.track.score, h.lines.as_slice()));
+        let scored = likely.map(|h| ScoredLines { score: h.track.score, lines: &h.lines });
         let selection = Selection::new(scored, self.shared_lines);
         let sure: Vec<usize> = selection
             .chosen()
@@ -459,15 +459,15 @@ impl Hypotheses {
         let lines: BTreeSet<LineId> = sure
             .iter()
             .flat_map(|&i| &self.hypotheses[i].lines)
-            .map(|(_, id)| id.clone())
+            .map(|line| line.id.clone())
             .collect();
         let starts = sure.iter().map(|&i| self.start(&self.hypotheses[i])).collect();
         if !lines.is_empty() {
-            self.hypotheses.retain(|h| h.lines.iter().all(|(_, id)| !lines.contains(id)));
+            self.hypotheses.retain(|h| h.lines.iter().all(|line| !lines.contains(&line.id)));
         }
         if !self.claims.is_empty() {
             let alive: BTreeSet<&LineId> =
-                self.hypotheses.iter().flat_map(|h| &h.lines).map(|(_, id)| id).collect();
+                self.hypotheses.iter().flat_map(|h| &h.lines).map(|line| &line.id).collect();
             self.claims.retain(|id, _| alive.contains(id));
         }
         starts
@@ -477,8 +477,8 @@ impl Hypotheses {
         let mut track = Track::clone(&hypothesis.track);
         track.status = TrackStatus::Confirmed;
         track.observe();
-        let claimed_by =
-            hypothesis.lines.iter().filter_map(|(_, id)| self.claims.get(id)).copied().collect();
+        let lines = hypothesis.lines.iter();
+        let claimed_by = lines.filter_map(|line| self.claims.get(&line.id)).copied().collect();
         Start { track, cameras: hypothesis.cameras().len(), claimed_by }
     }
 }

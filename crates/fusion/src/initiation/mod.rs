@@ -24,6 +24,7 @@ use crate::motion::MotionSetup;
 use crate::papers::Grouped;
 use crate::spatial::{LineId, TimedLine};
 use crate::track::{Track, TrackId};
+use crate::tracker::UsedSighting;
 use crate::{Exposure, FusionConfig, InitiationMethod, Sighting, SpatialSolver};
 
 pub(crate) use passing::{Passing, Passings};
@@ -94,12 +95,12 @@ impl Initiator {
         }
     }
 
-    /// Handles a whole exposure, given which of its lines (by index) tracks have used, and returns
+    /// Handles a whole exposure, given which of its lines tracks have used, and returns
     /// the new tracks of targets that cameras see one after another.
     pub(crate) fn hand_over(
         &mut self,
         exposure: &Exposure,
-        used: &[(usize, TrackId)],
+        used: &[UsedSighting],
         known: &KnownCamera,
         motion: &MotionSetup,
     ) -> Vec<Start> {
@@ -110,11 +111,11 @@ impl Initiator {
     }
 
     /// Adds an exposure's free bearings and returns the tracks that begin with them. `claims` are
-    /// those (by index) that a track has used which only one camera supports.
+    /// those that a track has used which only one camera supports.
     pub(crate) fn add(
         &mut self,
         exposure: Exposure,
-        claims: &[(usize, TrackId)],
+        claims: &[UsedSighting],
         cameras: &Cameras,
         motion: &MotionSetup,
     ) -> Vec<Start> {

@@ -2,12 +2,13 @@
 //! own.
 
 use crossfix_geometry::SightLine;
-use crossfix_message::{CameraName, Timestamp};
+use crossfix_message::CameraName;
 use nalgebra::Point3;
 
+use super::NamedLine;
 use super::sight::DirectionFilter;
 use crate::prediction::BearingPrediction;
-use crate::spatial::TYPICAL_SPEED;
+use crate::spatial::{TYPICAL_SPEED, TimedLine};
 use crate::track::TrackBearing;
 use crate::visibility::independent_share;
 
@@ -49,23 +50,18 @@ pub(super) struct OneTargetTest {
 impl OneTargetTest {
     /// The test for the lines of a seed, with its log-likelihood ratio; at `place` the target may
     /// have a speed of `speed` (m/s, standard deviation).
-    pub(super) fn begin<'a>(
-        lines: impl Iterator<Item = (&'a CameraName, &'a SightLine, Timestamp)>,
+    pub(super) fn begin(
+        lines: &[NamedLine],
         place: Point3<f64>,
         speed: f64,
         log_ratio: f64,
     ) -> Self {
-        let sight = |(camera, line, time): (&CameraName, &SightLine, Timestamp)| {
+        let sights = lines.iter().map(|((camera, ..), TimedLine { line, time, .. })| {
             // A speed of v across the line turns it at v / r.
             let range = (place - line.origin).norm();
-            (camera.clone(), DirectionFilter::first(line, time, speed / range))
-        };
-        Self {
-            sights: lines.map(sight).collect(),
-            silent: Vec::new(),
-            log_ratio,
-            inconclusive: false,
-        }
+            (camera.clone(), DirectionFilter::first(line, *time, speed / range))
+        });
+        Self { sights: sights.collect(), silent: Vec::new(), log_ratio, inconclusive: false }
     }
 
     /// The test for what one camera alone has followed so far.

@@ -39,7 +39,7 @@ impl Passings {
     pub(crate) fn of(&self, first: &TimedLine, second: &TimedLine) -> Passing {
         let (u, v) = (&first.line.direction, &second.line.direction);
         let base = second.line.origin - first.line.origin;
-        let [r1, r2] = passing_ranges((first.line.origin, u), (second.line.origin, v));
+        let [r1, r2] = passing_ranges(first.line.ray(), second.line.ray());
         let in_range = |r: f64| r > 0.0 && r < self.max_range_m;
         if !(in_range(r1) && in_range(r2)) {
             return Passing::Nowhere;

@@ -84,6 +84,26 @@ struct Growing<'a> {
     lines: &'a [Vec<NamedLine>],
 }
 
+/// A line of a period, by indices.
+#[derive(Clone, Copy, Debug)]
+struct LineIndex {
+    /// Of its exposure in the period.
+    exposure: usize,
+    /// Of the line in that exposure.
+    line: usize,
+}
+
+impl Growing<'_> {
+    fn line(&self, at: LineIndex) -> &NamedLine {
+        &self.lines[at.exposure][at.line]
+    }
+
+    /// Whether a line is to an object fixed in its camera's view.
+    fn rooted(&self, at: LineIndex) -> Rooted {
+        self.exposures[at.exposure].sightings[at.line].rooted
+    }
+}
+
 impl SeedFinder {
     /// A search for sets of at least `least_cameras` cameras with a log-likelihood ratio above
     /// `least_score`.
@@ -124,22 +144,21 @@ impl SeedFinder {
                     if settled[a][i] || settled[b][j] || enough {
                         continue;
                     }
-                    let both = |rooted| {
-                        [(a, i), (b, j)]
-                            .iter()
-                            .all(|&(k, l)| exposures[k].sightings[l].rooted == rooted)
-                    };
-                    if both(Rooted::Yes) && exposures.len() == 2 {
+                    let both =
+                        [LineIndex { exposure: a, line: i }, LineIndex { exposure: b, line: j }];
+                    let is_rooted = both.iter().all(|&at| growing.rooted(at) == Rooted::Yes);
+                    if is_rooted && exposures.len() == 2 {
                         continue;
                     }
-                    if self.passings.of(&lines[a][i].1, &lines[b][j].1) != Passing::Close {
+                    let [one, other] = both.map(|at| &growing.line(at).1);
+                    if self.passings.of(one, other) != Passing::Close {
                         continue;
                     }
                     close += 1;
-                    for (places, seed) in self.sets_of(&growing, (a, i), (b, j)) {
-                        if places.len() >= SETTLED_CAMERAS {
-                            for (camera, line) in places {
-                                settled[camera][line] = true;
+                    for (set, seed) in self.sets_of(&growing, both) {
+                        if set.len() >= SETTLED_CAMERAS {
+                            for LineIndex { exposure, line } in set {
+                                settled[exposure][line] = true;
                             }
                         }
                         seeds.push(seed);
@@ -198,29 +217,24 @@ impl SeedFinder {
         pairs.into_iter().map(|(_, pair)| pair).collect()
     }
 
-    /// The seeds that grow from two lines, with the places (camera, line) of their lines.
-    fn sets_of(
-        &self,
-        growing: &Growing<'_>,
-        (a, i): (usize, usize),
-        (b, j): (usize, usize),
-    ) -> Vec<(Vec<(usize, usize)>, Seed)> {
-        let (first, second) = (&growing.lines[a][i], &growing.lines[b][j]);
-        let Some(pair) = self.solve(&[first.1.clone(), second.1.clone()]) else {
+    /// The seeds that grow from two lines, with their sets of lines.
+    fn sets_of(&self, growing: &Growing<'_>, both: [LineIndex; 2]) -> Vec<(Vec<LineIndex>, Seed)> {
+        let Some(pair) = self.solve(&both.map(|at| growing.line(at).1.clone())) else {
             return Vec::new();
         };
-        let mut open = vec![(vec![(a, i), (b, j)], pair)];
+        let mut open = vec![(both.to_vec(), pair)];
         let mut branched = false;
-        for c in (0..growing.exposures.len()).filter(|&c| c != a && c != b) {
+        let others = |c: &usize| both.iter().all(|at| at.exposure != *c);
+        for c in (0..growing.exposures.len()).filter(others) {
             let mut next = Vec::new();
-            for (places, solution) in open {
-                let near = self.near(growing, &places, &solution, c);
+            for (set, solution) in open {
+                let near = self.near(growing, &set, &solution, c);
                 let most = if branched { 1 } else { BOUNDS.branches };
                 for line in near.iter().take(most) {
-                    let mut longer = places.clone();
-                    longer.push((c, *line));
+                    let mut longer = set.clone();
+                    longer.push(LineIndex { exposure: c, line: *line });
                     let timed: Vec<TimedLine> =
-                        longer.iter().map(|&(k, l)| growing.lines[k][l].1.clone()).collect();
+                        longer.iter().map(|&at| growing.line(at).1.clone()).collect();
                     if let Some(solution) =
                         self.solve(&timed).filter(|s| self.agrees(s, longer.len()))
                     {
@@ -231,16 +245,16 @@ impl SeedFinder {
                 // After the first branching only the nearest line of each camera is tried: the
                 // number of sets grows no further.
                 if !branched || near.is_empty() || next.is_empty() {
-                    next.push((places, solution));
+                    next.push((set, solution));
                 }
             }
             branched |= next.len() > 1;
             open = next;
         }
         let mut found = Vec::new();
-        for (places, solution) in open {
-            if let Some(seed) = self.seed(growing, &places, solution) {
-                found.push((places, seed));
+        for (set, solution) in open {
+            if let Some(seed) = self.seed(growing, &set, solution) {
+                found.push((set, seed));
             }
         }
         found
@@ -258,16 +272,16 @@ impl SeedFinder {
         solution.chi_square <= gate
     }
 
-    /// The lines of camera `c` in the gate of a solution, the nearest first.
+    /// The lines of exposure `c` in the gate of a set's solution, the nearest first.
     fn near(
         &self,
         growing: &Growing<'_>,
-        places: &[(usize, usize)],
+        set: &[LineIndex],
         solution: &MapSolution,
         c: usize,
     ) -> Vec<usize> {
         let known = growing.cameras.known(&growing.exposures[c].camera);
-        let newest = places.iter().map(|&(k, l)| growing.lines[k][l].1.time).max();
+        let newest = set.iter().map(|&at| growing.line(at).1.time).max();
         let (Some(known), Some(reference), Some((_, first))) =
             (known, newest, growing.lines[c].first())
         else {
@@ -297,14 +311,13 @@ impl SeedFinder {
     fn seed(
         &self,
         growing: &Growing<'_>,
-        places: &[(usize, usize)],
+        set: &[LineIndex],
         solution: MapSolution,
     ) -> Option<Seed> {
-        if places.len() < self.least_cameras || is_rooted(growing, places) {
+        if set.len() < self.least_cameras || is_rooted(growing, set) {
             return None;
         }
-        let mut lines: Vec<NamedLine> =
-            places.iter().map(|&(k, l)| growing.lines[k][l].clone()).collect();
+        let mut lines: Vec<NamedLine> = set.iter().map(|&at| growing.line(at).clone()).collect();
         lines.sort_by(|x, y| x.1.time.cmp(&y.1.time).then_with(|| x.0.cmp(&y.0)));
         let position = solution.state.position();
         let in_range =
@@ -314,7 +327,7 @@ impl SeedFinder {
         }
         // Cameras that should have seen it and have no line of it: each counts ln(1 - P_D).
         let silent = growing.exposures.iter().enumerate().filter(|(k, exposure)| {
-            let missed = places.iter().all(|(camera, _)| camera != k);
+            let missed = set.iter().all(|at| at.exposure != *k);
             missed
                 && growing
                     .cameras
@@ -322,7 +335,7 @@ impl SeedFinder {
                     .is_some_and(|known| known.expects(position, self.initiation.max_range_m))
         });
         let false_alarms: f64 =
-            places.iter().map(|&(k, _)| growing.exposures[k].clutter_per_sr.ln()).sum();
+            set.iter().map(|at| growing.exposures[at.exposure].clutter_per_sr.ln()).sum();
         let score = self.log_evidence(&lines, &solution)? - false_alarms
             + silent.count() as f64 * (1.0 - self.detection_probability).ln();
         (score > self.least_score).then_some(Seed { lines, solution, score })
@@ -359,10 +372,10 @@ impl SeedFinder {
 /// Whether a set consists of lines to objects fixed in their cameras' views. As long as this is
 /// unknown of a line (its camera has only begun to look), two cameras are not enough and three must
 /// agree.
-fn is_rooted(growing: &Growing<'_>, places: &[(usize, usize)]) -> bool {
-    let rooted = || places.iter().map(|&(k, l)| growing.exposures[k].sightings[l].rooted);
+fn is_rooted(growing: &Growing<'_>, set: &[LineIndex]) -> bool {
+    let rooted = || set.iter().map(|&at| growing.rooted(at));
     rooted().all(|rooted| rooted == Rooted::Yes)
-        || (places.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown))
+        || (set.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown))
 }
 
 fn ids(seed: &Seed) -> Vec<LineId> {

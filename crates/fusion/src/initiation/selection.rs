@@ -14,6 +14,21 @@ const MAX_COMPARISONS: usize = 20_000_000;
 /// it the same.
 const MAX_PASSES: usize = 20;
 
+/// A line of a leaf.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct PeriodLine {
+    /// The number of its period.
+    pub(super) period: u64,
+    pub(super) id: LineId,
+}
+
+/// A leaf: its score and its lines.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ScoredLines<'a> {
+    pub(super) score: f64,
+    pub(super) lines: &'a [PeriodLine],
+}
+
 /// Bearings that may be one target's, and their score.
 #[derive(Clone, Debug)]
 struct ScoredBearings {
@@ -36,22 +51,21 @@ pub(super) struct Selection {
 }
 
 impl Selection {
-    /// The best set found among leaves, given as scores with lines; `shared_lines` is how many
-    /// lines two chosen leaves may have in common. Leaves with a score of 0 or less are never
-    /// chosen.
+    /// The best set found among leaves; `shared_lines` is how many lines two chosen leaves may have
+    /// in common. Leaves with a score of 0 or less are never chosen.
     ///
     /// Choosing greedily by score lets a leaf that mixes several targets' bearings shut out all of
     /// their own leaves. So the choice is improved by exchange: a leaf is taken out if those that
     /// it kept out are worth more.
     pub(super) fn new<'a>(
-        scored: impl Iterator<Item = (f64, &'a [(u64, LineId)])>,
+        scored: impl Iterator<Item = ScoredLines<'a>>,
         shared_lines: usize,
     ) -> Self {
         let mut numbers: BTreeMap<&LineId, usize> = BTreeMap::new();
         let mut leaves = Vec::new();
-        for (score, lines) in scored {
+        for ScoredLines { score, lines } in scored {
             let mut own: Vec<usize> = Vec::with_capacity(lines.len());
-            for (_, id) in lines {
+            for PeriodLine { id, .. } in lines {
                 let next = numbers.len();
                 own.push(*numbers.entry(id).or_insert(next));
             }
@@ -196,12 +210,10 @@ mod tests {
     use super::*;
 
     fn select(leaves: &[(f64, &[usize])], shared: usize) -> Selection {
-        let lines = |ids: &[usize]| -> Vec<(u64, LineId)> {
-            ids.iter().map(|&i| (0, ("a".parse().unwrap(), 0, i))).collect()
-        };
-        let owned: Vec<(f64, Vec<(u64, LineId)>)> =
-            leaves.iter().map(|(s, l)| (*s, lines(l))).collect();
-        Selection::new(owned.iter().map(|(s, l)| (*s, l.as_slice())), shared)
+        let line = |&i: &usize| PeriodLine { period: 0, id: ("a".parse().unwrap(), 0, i) };
+        let owned: Vec<(f64, Vec<PeriodLine>)> =
+            leaves.iter().map(|(s, l)| (*s, l.iter().map(line).collect())).collect();
+        Selection::new(owned.iter().map(|(s, l)| ScoredLines { score: *s, lines: l }), shared)
     }
 
     #[test]

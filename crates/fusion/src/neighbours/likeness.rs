@@ -21,7 +21,7 @@ const UNLIKE: f64 = 16.3;
 const PARTED: f64 = 3.0 * UNLIKE;
 /// A squared distance counts no more than this, so that one bad update is outweighed in a second.
 /// With half of it two that part are told apart after 1.1 s and not after 0.4 s.
-const MOST: f64 = 3.0 * PARTED;
+const MAX_DISTANCE: f64 = 3.0 * PARTED;
 /// Assumed density of targets, 1/m^3: one in a cube of 100 m. With ten times as much the error has
 /// to be half as large before two tracks are one.
 const DENSITY: f64 = 1e-6;
@@ -29,8 +29,21 @@ const DENSITY: f64 = 1e-6;
 /// half of it one pairing in fifty may be wrong, and two targets have one number.
 const CLEARLY: f64 = 100.0;
 
-/// A track of a neighbour: which neighbour, and under which number it says it.
-pub(super) type NeighbourTrackId = (usize, Number);
+/// A track of a neighbour.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct NeighbourTrackId {
+    /// Which neighbour.
+    pub(super) neighbour: usize,
+    /// The number under which it says the track.
+    pub(super) number: Number,
+}
+
+/// A track here and one of a neighbour.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct TrackPair {
+    pub(super) own: Own,
+    pub(super) theirs: NeighbourTrackId,
+}
 
 /// How well the places of two tracks have agreed lately, as means over about [`LONG_ENOUGH_S`].
 #[derive(Clone, Copy, Debug)]
@@ -60,18 +73,25 @@ impl TrackLikeness {
         let by_chance = CLEARLY * DENSITY * (2.0 * std::f64::consts::PI).powf(1.5);
         self.distance < UNLIKE && self.cost < -2.0 * by_chance.ln()
     }
+
+    /// Whether this pair and another cannot both be of one target, and this one is not clearly the
+    /// less likely.
+    fn rivals(&self, other: &Self, now: Timestamp) -> bool {
+        // Costs are -2 ln L: a rival is one that is not less likely by the factor `CLEARLY`.
+        self.is_of_late(now) && self.cost < other.cost + 2.0 * CLEARLY.ln()
+    }
 }
 
 /// All pairs of tracks that may be of one target.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Likenesses(BTreeMap<(Own, NeighbourTrackId), TrackLikeness>);
+pub(super) struct Likenesses(BTreeMap<TrackPair, TrackLikeness>);
 
 impl Likenesses {
     /// Compares two states of one time; `is_one` is for tracks that are said under one number,
     /// whose pair is kept whatever comes out.
     pub(super) fn see(
         &mut self,
-        pair: (Own, NeighbourTrackId),
+        pair: TrackPair,
         is_one: bool,
         [here, there]: [&KinematicState; 2],
         now: Timestamp,
@@ -85,7 +105,7 @@ impl Likenesses {
         }
         let Some(factor) = spread.cholesky() else { return };
         // -2 ln N(d; 0, S) = d' S^-1 d + ln det S, less a constant.
-        let distance = apart.dot(&factor.solve(&apart)).min(MOST);
+        let distance = apart.dot(&factor.solve(&apart)).min(MAX_DISTANCE);
         let cost = distance + 2.0 * factor.l().diagonal().map(f64::ln).sum();
         let new = TrackLikeness { since: now, seen: now, distance, cost };
         let known = self.0.entry(pair).or_insert(new);
@@ -104,8 +124,10 @@ impl Likenesses {
     }
 
     fn of_own(&self, own: Own) -> impl Iterator<Item = (NeighbourTrackId, &TrackLikeness)> {
-        let all = (own, (0, Number(0)))..=(own, (usize::MAX, Number(u64::MAX)));
-        self.0.range(all).map(|((_, said), likeness)| (*said, likeness))
+        let first = NeighbourTrackId { neighbour: 0, number: Number(0) };
+        let last = NeighbourTrackId { neighbour: usize::MAX, number: Number(u64::MAX) };
+        let all = TrackPair { own, theirs: first }..=TrackPair { own, theirs: last };
+        self.0.range(all).map(|(pair, likeness)| (pair.theirs, likeness))
     }
 
     /// The neighbours' tracks that are beyond doubt of the same target as one here: at most one per
@@ -116,27 +138,23 @@ impl Likenesses {
         now: Timestamp,
     ) -> impl Iterator<Item = NeighbourTrackId> + '_ {
         self.of_own(own)
-            .filter(move |(said, likeness)| self.is_sure((own, *said), likeness, now))
+            .filter(move |(said, likeness)| {
+                self.is_sure(TrackPair { own, theirs: *said }, likeness, now)
+            })
             .map(|(said, _)| said)
     }
 
-    fn is_sure(
-        &self,
-        (own, said): (Own, NeighbourTrackId),
-        likeness: &TrackLikeness,
-        now: Timestamp,
-    ) -> bool {
-        let is_rival = |other: &TrackLikeness| {
-            // Costs are -2 ln L: a rival is one that is not less likely by the factor `CLEARLY`.
-            other.is_of_late(now) && other.cost < likeness.cost + 2.0 * CLEARLY.ln()
-        };
-        let mut of_neighbour = self.of_own(own).filter(|(other, _)| other.0 == said.0);
-        let mut of_said = self.0.iter().filter(|((_, other), _)| *other == said);
+    fn is_sure(&self, pair: TrackPair, likeness: &TrackLikeness, now: Timestamp) -> bool {
+        let neighbour = pair.theirs.neighbour;
+        let mut of_neighbour =
+            self.of_own(pair.own).filter(|(other, _)| other.neighbour == neighbour);
+        let mut of_theirs = self.0.iter().filter(|(other, _)| other.theirs == pair.theirs);
         likeness.is_of_late(now)
             && likeness.has_lasted()
             && likeness.is_likely()
-            && !of_neighbour.any(|(other, likeness)| other != said && is_rival(likeness))
-            && !of_said.any(|((other, _), likeness)| *other != own && is_rival(likeness))
+            && !of_neighbour
+                .any(|(other, rival)| other != pair.theirs && rival.rivals(likeness, now))
+            && !of_theirs.any(|(other, rival)| other.own != pair.own && rival.rivals(likeness, now))
     }
 
     /// Whether a track here may be one of the neighbours'.
@@ -146,12 +164,13 @@ impl Likenesses {
 
     /// Whether two tracks that are said under one number are near enough to be of one target.
     pub(super) fn may_be_one(&self, own: Own, said: NeighbourTrackId) -> bool {
-        self.0.get(&(own, said)).is_some_and(|likeness| likeness.distance < PARTED)
+        let likeness = self.0.get(&TrackPair { own, theirs: said });
+        likeness.is_some_and(|likeness| likeness.distance < PARTED)
     }
 
     /// Whether two tracks that are said under one number are of two targets, beyond doubt.
     pub(super) fn have_parted(&self, own: Own, said: NeighbourTrackId) -> bool {
-        let likeness = self.0.get(&(own, said));
+        let likeness = self.0.get(&TrackPair { own, theirs: said });
         likeness.is_some_and(|likeness| likeness.has_lasted() && likeness.distance > PARTED)
     }
 

@@ -30,7 +30,7 @@ use crossfix_message::{
 
 use crate::{FusionConfig, Output};
 use known::{Grip, KEPT_EVERY_S, Ours, Theirs, Voice, event, state_of};
-use likeness::{Likenesses, NeighbourTrackId};
+use likeness::{Likenesses, NeighbourTrackId, TrackPair};
 
 /// A track of which nothing has been heard for this long is no longer said, s: each is said at
 /// least every half second. With half of it a message that is lost ends the track; with twice as
@@ -45,7 +45,7 @@ const COMPARED_EVERY_S: f64 = 0.1;
 const HELD_BACK_S: f64 = 2.0;
 /// Most tracks of neighbours that are kept in mind. Memory is bounded; beyond it a target that
 /// flies in has a second number here.
-const MOST_TRACKS: usize = 10_000;
+const MAX_TRACKS: usize = 10_000;
 
 /// Place of one fusion centre among those of its site.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -130,16 +130,16 @@ impl Neighbours {
         let (time, heard) = (Timestamp::from_nanos(frame.time_ns), self.now);
         self.newest.insert(index, time);
         let is_said = |track: &Theirs| time.seconds_since(track.time).abs() < HEARD_FOR_S;
-        self.theirs.retain(|(who, _), track| *who != index || is_said(track));
+        self.theirs.retain(|said, track| said.neighbour != index || is_said(track));
         for track in &frame.tracks {
-            let said = (index, Number(track.id));
+            let said = NeighbourTrackId { neighbour: index, number: Number(track.id) };
             // Before a track is sure it may be nothing.
             let is_sure = !matches!(track.state(), TrackState::Lost | TrackState::Tentative);
             let Some(state) = state_of(track).filter(|_| is_sure) else {
                 self.theirs.remove(&said);
                 continue;
             };
-            if self.theirs.len() < MOST_TRACKS || self.theirs.contains_key(&said) {
+            if self.theirs.len() < MAX_TRACKS || self.theirs.contains_key(&said) {
                 let grip = Grip::of(track, &state);
                 // A neighbour that does not say when a track began has not said it before.
                 let began = (track.born_ns != 0).then(|| Timestamp::from_nanos(track.born_ns));
@@ -154,8 +154,8 @@ impl Neighbours {
 
     /// Whether a neighbour says a track now: by the neighbour's own time it has done so lately, and
     /// by the time here it has not fallen silent.
-    fn is_said(&self, (index, _): NeighbourTrackId, theirs: &Theirs) -> bool {
-        let newest = self.newest.get(&index).copied().unwrap_or(theirs.time);
+    fn is_said(&self, said: NeighbourTrackId, theirs: &Theirs) -> bool {
+        let newest = self.newest.get(&said.neighbour).copied().unwrap_or(theirs.time);
         let silent_s = match (self.now, theirs.heard) {
             (Some(now), Some(heard)) => now.seconds_since(heard),
             _ => 0.0,
@@ -259,7 +259,8 @@ impl Neighbours {
             let here = earlier.as_ref().unwrap_or(&state);
             let when = if is_behind { theirs.time } else { now };
             if let Some(there) = theirs.past.at(when, self.density) {
-                self.likenesses.see((own, *said), said.1 == number, [here, &there], now);
+                let pair = TrackPair { own, theirs: *said };
+                self.likenesses.see(pair, said.number == number, [here, &there], now);
             }
         }
         true
@@ -268,7 +269,8 @@ impl Neighbours {
     /// The neighbours' tracks of a number that are said now.
     fn of_number(&self, number: Number) -> impl Iterator<Item = (NeighbourTrackId, &Theirs)> {
         let of_neighbour = move |index: &usize| {
-            let (said, theirs) = self.theirs.get_key_value(&(*index, number))?;
+            let said = NeighbourTrackId { neighbour: *index, number };
+            let (said, theirs) = self.theirs.get_key_value(&said)?;
             self.is_said(*said, theirs).then_some((*said, theirs))
         };
         self.newest.keys().filter_map(of_neighbour)
@@ -297,7 +299,7 @@ impl Neighbours {
         };
         let same = self.likenesses.same_as(own, now);
         let elder = same
-            .filter_map(|said| Some((self.theirs.get(&said)?.born, said.1)))
+            .filter_map(|said| Some((self.theirs.get(&said)?.born, said.number)))
             // The eldest, and of two of one age the smaller number: both centres find the same.
             .min()
             .filter(|elder| *elder < (born, before) && is_free(elder.1))?;
@@ -333,13 +335,14 @@ impl Neighbours {
             });
         }
         let grip = Grip::of(track, &state_of(track)?);
-        let is_outdone = theirs.any(|((index, _), theirs)| match ours.voice {
+        let is_outdone = theirs.any(|(said, theirs)| match ours.voice {
             Voice::Speaking(since) => {
                 // What the neighbour said before this centre began is why this one began. Where
                 // both began at once, one goes on.
                 let is_new = theirs.heard.is_some_and(|heard| heard > since);
                 // A tie is decided by the centres' order, which both know alike.
-                let yields = index < self.share.index && !grip.is_better_than(&theirs.grip);
+                let yields =
+                    said.neighbour < self.share.index && !grip.is_better_than(&theirs.grip);
                 is_new && (theirs.grip.is_better_than(&grip) || yields)
             }
             Voice::Silent | Voice::Unsaid => !grip.is_better_than(&theirs.grip),

@@ -8,7 +8,7 @@ use crate::cameras::Cameras;
 use crate::initiation::{NamedLine, Start};
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
-use crate::track::{Track, TrackBearing};
+use crate::track::{StartLine, Track, TrackBearing};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig};
 
@@ -62,17 +62,15 @@ impl Grouped {
 fn start(group: &Group, motion: &MotionSetup) -> Option<Track> {
     let (fix, later) = starting_point(group)?;
     let vague = Fix { state: vague_velocity(fix), ..fix.clone() };
-    let named = group
-        .fixes
-        .first()?
-        .lines
-        .iter()
-        .map(|((camera, ..), line)| (camera, line, CameraUncertainty::of_time(0.0)));
+    let uncertainty = CameraUncertainty::of_time(0.0);
+    let first = group.fixes.first()?;
+    let named = first.lines.iter();
+    let named = named.map(|((camera, ..), line)| StartLine { camera, line, uncertainty });
     let mut track = Track::start(&vague, named, motion);
     for ((camera, ..), timed) in later {
         let (time, line) = (timed.time, &timed.line);
-        let uncertainty = &CameraUncertainty::of_time(0.0);
-        track.measurement_update(TrackBearing { camera, time, line, uncertainty }, motion)?;
+        let bearing = TrackBearing { camera, time, line, uncertainty: &uncertainty };
+        track.measurement_update(bearing, motion)?;
     }
     track.solver = fix.solver;
     Some(track)

@@ -14,19 +14,7 @@ use crate::spatial::{Observability, TimedLine, WeakAxis, determined};
 /// first two lines are parallel.
 pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSolution> {
     let [first, second, third] = lines;
-    let [a1, a2, a3] = lines.map(|l| l.line.direction.into_inner());
-    let [b2, b3] = [second, third].map(|l| l.line.origin - first.line.origin);
-    let [dt2, dt3] = [second, third].map(|l| l.time.seconds_since(first.time));
-
-    let mut a = Matrix6::zeros();
-    // Rows of line k: r1 a1 - r_k a_k' + V dt_k = b_k.
-    for (rows, line_column, line, dt) in [(0, 1, a2, dt2), (3, 2, a3, dt3)] {
-        a.fixed_view_mut::<3, 1>(rows, 0).copy_from(&a1);
-        a.fixed_view_mut::<3, 1>(rows, line_column).copy_from(&-line);
-        a.fixed_view_mut::<3, 3>(rows, 3).fill_with_identity();
-        a.fixed_view_mut::<3, 3>(rows, 3).scale_mut(dt);
-    }
-    let b = Vector6::new(b2.x, b2.y, b2.z, b3.x, b3.y, b3.z);
+    let (a, b) = system(lines);
 
     // Fixed size, so nalgebra: faer's SVD of a 6x6 takes two to three times as long
     // (benches/solvers).
@@ -64,7 +52,7 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
     };
     let velocity = Vector3::new(x[3], x[4], x[5]);
     // The position is refined by the first pair, with the displacement V dt2 removed.
-    let refined = pair(first, second, velocity * dt2)?;
+    let refined = pair(first, second, velocity * second.time.seconds_since(first.time))?;
     Some(RangeSolution {
         ranges: vec![x[0], x[1], x[2]],
         velocity,
@@ -72,6 +60,23 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
         position: refined.position,
         observability,
     })
+}
+
+/// A and b of the system A x = b for the three ranges and the velocity.
+fn system(lines: [&TimedLine; 3]) -> (Matrix6<f64>, Vector6<f64>) {
+    let [first, second, third] = lines;
+    let [a1, a2, a3] = lines.map(|l| l.line.direction.into_inner());
+    let [b2, b3] = [second, third].map(|l| l.line.origin - first.line.origin);
+    let [dt2, dt3] = [second, third].map(|l| l.time.seconds_since(first.time));
+    let mut a = Matrix6::zeros();
+    // Rows of line k: r1 a1 - r_k a_k' + V dt_k = b_k.
+    for (rows, line_column, line, dt) in [(0, 1, a2, dt2), (3, 2, a3, dt3)] {
+        a.fixed_view_mut::<3, 1>(rows, 0).copy_from(&a1);
+        a.fixed_view_mut::<3, 1>(rows, line_column).copy_from(&-line);
+        a.fixed_view_mut::<3, 3>(rows, 3).fill_with_identity();
+        a.fixed_view_mut::<3, 3>(rows, 3).scale_mut(dt);
+    }
+    (a, Vector6::new(b2.x, b2.y, b2.z, b3.x, b3.y, b3.z))
 }
 
 fn condition_number(a: &Matrix6<f64>) -> f64 {

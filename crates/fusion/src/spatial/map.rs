@@ -50,49 +50,21 @@ pub fn map(
         prior[(axis, axis)] = velocity_sd.powi(-2);
     }
     let mut state: Option<Vector6<f64>> = None;
-    let mut data = Matrix6::zeros();
+    let mut information = Matrix6::zeros();
     let mut chi_square = 0.0;
     for _ in 0..ITERATIONS {
-        data = Matrix6::zeros();
-        let mut right = Vector6::zeros();
-        let mut squares = 0.0;
-        let mut nearest = f64::INFINITY;
-        for timed @ TimedLine { line, time, .. } in lines {
-            let dt = time.seconds_since(reference);
-            let offset = |x: &Vector6<f64>| {
-                Point3::from(x.fixed_rows::<3>(0) + x.fixed_rows::<3>(3) * dt) - line.origin
-            };
-            // The first iteration weights all lines as if they had the same range. A state behind
-            // the camera counts as just in front of it here, and is refused at the end.
-            let range = state.as_ref().map_or(1.0, |x| offset(x).dot(&line.direction).max(1e-3));
-            nearest = nearest.min(range);
-            // With the tangents E, H x = z is linear in the state: E' (p + v dt - c) / range = 0.
-            let tangents = line.basis.transpose() / range;
-            let mut h = Matrix2x6::zeros();
-            h.fixed_view_mut::<2, 3>(0, 0).copy_from(&tangents);
-            h.fixed_view_mut::<2, 3>(0, 3).copy_from(&(tangents * dt));
-            let noise =
-                if state.is_some() { timed.noise_at(range, velocity_sd) } else { line.covariance };
-            let weight = noise.try_inverse()?;
-            let target = tangents * line.origin.coords;
-            // Normal equations: the sums of H' W H and of H' W z.
-            data += h.transpose() * weight * h;
-            right += h.transpose() * weight * target;
-            if let Some(x) = &state {
-                let residual = h * x - target;
-                squares += (residual.transpose() * weight * residual).x;
-            }
-        }
+        let equations = NormalEquations::of(lines, reference, velocity_sd, state.as_ref())?;
+        information = equations.information;
         if let Some(x) = &state {
-            chi_square = squares + (x.transpose() * prior * x).x;
+            chi_square = equations.squares + (x.transpose() * prior * x).x;
         }
         // x = (H' W H + P0^-1)^-1 H' W z, where the prior has zero mean.
-        let next = (data + prior).cholesky()?.solve(&right);
+        let next = (information + prior).cholesky()?.solve(&equations.right);
         let moved = state.map_or(f64::INFINITY, |x| (next - x).fixed_rows::<3>(0).norm());
         state = Some(next);
         // The squares are of the state before this step: it must hardly have been off when the loop
         // ends.
-        if moved < SETTLED * nearest {
+        if moved < SETTLED * equations.nearest {
             break;
         }
     }
@@ -103,14 +75,68 @@ pub fn map(
         .fold(0.0, f64::max);
     in_front(lines, reference, &mean).then_some(())?;
     // Rounding leaves the inverse of a nearly singular system not quite symmetric.
-    let inverse = (data + prior).cholesky()?.inverse();
+    let inverse = (information + prior).cholesky()?.inverse();
     let covariance = (inverse + inverse.transpose()) / 2.0;
     Some(MapSolution {
         state: KinematicState { mean, covariance },
         chi_square,
-        information: data,
+        information,
         scales: (scale, velocity_sd),
     })
+}
+
+/// The normal equations of lines at a state, with their residuals there.
+struct NormalEquations {
+    /// Sums of H' W H and of H' W z.
+    information: Matrix6<f64>,
+    right: Vector6<f64>,
+    /// Sum of the squared normalised residuals.
+    squares: f64,
+    /// The least range, m.
+    nearest: f64,
+}
+
+impl NormalEquations {
+    /// At a state at `reference`; without one all lines are weighted as if they had the same range.
+    fn of(
+        lines: &[TimedLine],
+        reference: crossfix_message::Timestamp,
+        velocity_sd: f64,
+        state: Option<&Vector6<f64>>,
+    ) -> Option<Self> {
+        let mut sums = Self {
+            information: Matrix6::zeros(),
+            right: Vector6::zeros(),
+            squares: 0.0,
+            nearest: f64::INFINITY,
+        };
+        for timed @ TimedLine { line, time, .. } in lines {
+            let dt = time.seconds_since(reference);
+            let offset = |x: &Vector6<f64>| {
+                Point3::from(x.fixed_rows::<3>(0) + x.fixed_rows::<3>(3) * dt) - line.origin
+            };
+            // A state behind the camera counts as just in front of it here, and is refused at the
+            // end.
+            let range = state.map_or(1.0, |x| offset(x).dot(&line.direction).max(1e-3));
+            sums.nearest = sums.nearest.min(range);
+            // With the tangents E, H x = z is linear in the state: E' (p + v dt - c) / range = 0.
+            let tangents = line.basis.transpose() / range;
+            let mut h = Matrix2x6::zeros();
+            h.fixed_view_mut::<2, 3>(0, 0).copy_from(&tangents);
+            h.fixed_view_mut::<2, 3>(0, 3).copy_from(&(tangents * dt));
+            let noise =
+                if state.is_some() { timed.noise_at(range, velocity_sd) } else { line.covariance };
+            let weight = noise.try_inverse()?;
+            let target = tangents * line.origin.coords;
+            sums.information += h.transpose() * weight * h;
+            sums.right += h.transpose() * weight * target;
+            if let Some(x) = state {
+                let residual = h * x - target;
+                sums.squares += (residual.transpose() * weight * residual).x;
+            }
+        }
+        Some(sums)
+    }
 }
 
 /// Whether a state at `reference` lies in front of every line's camera at the line's time.

@@ -37,11 +37,19 @@ pub struct WeakAxis {
     pub direction: Unit<Vector3<f64>>,
 }
 
+/// What a combination of unknowns has of one quantity.
+#[derive(Clone, Copy, Debug)]
+struct Part {
+    quantity: Quantity,
+    vector: Vector3<f64>,
+}
+
 impl WeakAxis {
     /// The part of a combination with the greatest norm; `None` if the combination is zero.
-    pub(crate) fn of_parts(parts: &[(Quantity, Vector3<f64>)]) -> Option<Self> {
-        let &(quantity, part) = parts.iter().max_by(|a, b| a.1.norm().total_cmp(&b.1.norm()))?;
-        let direction = Unit::try_new(part, f64::MIN_POSITIVE)?;
+    fn of_parts(parts: &[Part]) -> Option<Self> {
+        let largest = parts.iter().max_by(|a, b| a.vector.norm().total_cmp(&b.vector.norm()))?;
+        let &Part { quantity, vector } = largest;
+        let direction = Unit::try_new(vector, f64::MIN_POSITIVE)?;
         let sign = if direction[direction.iamax()] < 0.0 { -1.0 } else { 1.0 };
         Some(Self { quantity, direction: Unit::new_unchecked(direction.into_inner() * sign) })
     }
@@ -58,11 +66,11 @@ impl WeakAxis {
         // All ranges together are one part: they move with the one target.
         let length = ranges.iter().map(|range| range * range).sum::<f64>().sqrt();
         let position = along.try_normalize(f64::MIN_POSITIVE).unwrap_or_default() * length;
-        let mut parts = vec![(Quantity::Position, position)];
+        let mut parts = vec![Part { quantity: Quantity::Position, vector: position }];
         let quantities = [Quantity::Velocity, Quantity::Acceleration];
-        parts.extend(
-            quantities.into_iter().zip(motion.chunks_exact(3).map(Vector3::from_column_slice)),
-        );
+        let motion = motion.chunks_exact(3).map(Vector3::from_column_slice);
+        let motion = quantities.into_iter().zip(motion);
+        parts.extend(motion.map(|(quantity, vector)| Part { quantity, vector }));
         Self::of_parts(&parts)
     }
 }
@@ -126,8 +134,12 @@ impl Observability {
             // The vectors cost as much again, and a good track never asks for them.
             let eigen = scaled.symmetric_eigen();
             let combination = eigen.eigenvectors.column(eigen.eigenvalues.imin());
-            let part = |row: usize| combination.fixed_rows::<3>(row).into_owned();
-            WeakAxis::of_parts(&[(Quantity::Position, part(0)), (Quantity::Velocity, part(3))])
+            let of_state = [(Quantity::Position, 0), (Quantity::Velocity, 3)];
+            let parts = of_state.map(|(quantity, row)| Part {
+                quantity,
+                vector: combination.fixed_rows::<3>(row).into_owned(),
+            });
+            WeakAxis::of_parts(&parts)
         })
     }
 }

@@ -39,16 +39,26 @@ impl TrackExpectation {
             Self::Near(prediction) => prediction.fit(line, gate),
             Self::Along { state, seen_from, camera, errors } => {
                 let fit = |errors: &SharedErrors| {
-                    let Updated { nis, log_likelihood, .. } =
-                        updated(state, Some(*seen_from), &Measured { line, camera, errors })?;
-                    let fit = BearingFit { gate_distance: nis, log_density: log_likelihood };
-                    gate.holds(nis).then_some(fit)
+                    fit_along(state, *seen_from, &Measured { line, camera, errors }, gate)
                 };
                 let Some((anew, probability)) = errors.renewed() else { return fit(errors) };
                 BearingFit::likelier(fit(errors), fit(&anew), probability)
             }
         }
     }
+}
+
+/// How well a bearing fits a target whose range from `seen_from` is uncertain; `None` if it lies
+/// outside the gate.
+fn fit_along(
+    state: &KinematicState,
+    seen_from: Point3<f64>,
+    measured: &Measured<'_>,
+    gate: Gate,
+) -> Option<BearingFit> {
+    let Updated { nis, log_likelihood, .. } = updated(state, Some(seen_from), measured)?;
+    let fit = BearingFit { gate_distance: nis, log_density: log_likelihood };
+    gate.holds(nis).then_some(fit)
 }
 
 impl Track {

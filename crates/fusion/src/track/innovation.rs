@@ -46,6 +46,18 @@ impl Against<'_> {
         let factor = spread.cholesky()?;
         Some((offset.dot(&factor.solve(&offset)), factor.determinant()))
     }
+
+    /// Logarithm of the likelihood of errors that have this probability; the constant 2 pi is left
+    /// out, which is common to all.
+    fn log_likelihood(
+        &self,
+        innovation: &BearingInnovation,
+        errors: &SharedErrors,
+        probability: f64,
+    ) -> Option<f64> {
+        let (squared, determinant) = self.distance(innovation, errors)?;
+        Some(probability.ln() - (squared + determinant.ln()) / 2.0)
+    }
 }
 
 impl Track {
@@ -89,13 +101,8 @@ impl Track {
         let interval = time.seconds_since(self.updated);
         let before = self.imm.predicted(interval, motion.models(self.ranged));
         let against = Against { before: &before, line, uncertainty };
-        // ln of probability times normal density; the constant 2 pi is common to both cases.
-        let log_likelihood = |errors: &SharedErrors, probability: f64| {
-            let (squared, determinant) = against.distance(innovation, errors)?;
-            Some(probability.ln() - (squared + determinant.ln()) / 2.0)
-        };
-        let went_on = log_likelihood(errors, 1.0 - probability);
-        (log_likelihood(&anew, probability) > went_on).then_some(anew)
+        let went_on = against.log_likelihood(innovation, errors, 1.0 - probability);
+        (against.log_likelihood(innovation, &anew, probability) > went_on).then_some(anew)
     }
 
     /// Whether the manoeuvre detector fires on a bearing.

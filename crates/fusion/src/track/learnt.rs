@@ -14,6 +14,7 @@
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, Dyn, Matrix2, Matrix6, OMatrix, U2, U5, U6, Vector2};
 
+use super::ties::Rescaling;
 use super::{Ties, Track};
 use crate::uncertainty::{CONSIDERED, CorrelatedNoise, LASTING, SharedCovariance, SharedErrors};
 use crate::update::Told;
@@ -21,7 +22,7 @@ use crate::update::Told;
 /// Most cameras whose lasting errors a track learns, as an update's cost grows with the square of
 /// their number; the errors of the others are considered. With half as many, the velocities of a
 /// site of six cameras err by 1 % more.
-const MOST_LEARNT: usize = 8;
+const MAX_LEARNT: usize = 8;
 /// After this many decay times of an error nothing is left of what has been learnt of it (e^-5),
 /// and another camera may take its place. With half of it 8 % is thrown away.
 const FORGOTTEN: f64 = 5.0;
@@ -137,7 +138,7 @@ impl Track {
         if lasting.sd_rad <= 0.0 || !self.is_confirmed() || self.learnt.row_of(camera).is_some() {
             return;
         }
-        if self.learnt.cameras.len() == MOST_LEARNT {
+        if self.learnt.cameras.len() == MAX_LEARNT {
             let Some(row) = self.forgotten(now) else { return };
             self.forget(row);
         }
@@ -181,12 +182,10 @@ impl Track {
     /// The first row of a camera that has been silent for so long that nothing is left of what was
     /// learnt of its errors.
     fn forgotten(&self, now: Timestamp) -> Option<usize> {
-        let is_forgotten = |name: &CameraName| {
-            self.ties.get(name).is_none_or(|ties| {
-                ties.silent_s(now).is_none_or(|silent_s| silent_s > FORGOTTEN * ties.lasting_s)
-            })
-        };
-        self.learnt.rows().find(|(_, name)| is_forgotten(name)).map(|(row, _)| row)
+        let mut rows = self.learnt.rows();
+        let forgotten =
+            rows.find(|(_, name)| self.ties.get(*name).is_none_or(|ties| has_forgotten(ties, now)));
+        forgotten.map(|(row, _)| row)
     }
 
     /// Stops learning the errors in these two rows.
@@ -315,14 +314,14 @@ impl Track {
         between
     }
 
-    /// Passes on that `N` considered errors of a camera, from `first` on, have `ratio` times the
-    /// variance that was assumed; `scale` is the factor on their ties. What is correlated with them
-    /// changes accordingly. Returns the change of the state's covariance, (ratio - 1) X X'.
+    /// Passes on that `N` considered errors of a camera, from `first` on, have another variance
+    /// than was assumed. What is correlated with them changes accordingly. Returns the change of
+    /// the state's covariance, (ratio - 1) X X'.
     pub(super) fn rescale<const N: usize>(
         &mut self,
         camera: &CameraName,
         first: usize,
-        (ratio, scale): (f64, f64),
+        Rescaling { ratio, scale }: Rescaling,
     ) -> Option<Matrix6<f64>> {
         let ties = self.ties.get_mut(camera)?;
         let state = ties.covariance.fixed_columns::<N>(first).into_owned();
@@ -341,7 +340,7 @@ impl Track {
                 tied += state * own;
             }
         }
-        self.rescale_past::<N>(camera, first, (ratio, scale), &state);
+        self.rescale_past::<N>(camera, first, Rescaling { ratio, scale }, &state);
         Some(state * state.transpose() * (ratio - 1.0))
     }
 
@@ -357,20 +356,15 @@ impl Track {
     /// The part of the state's covariance that the shared errors cause, which is its lower bound.
     /// If rounding has made the learnt errors' covariance indefinite, they are reset.
     pub(super) fn shared_part(&mut self) -> Matrix6<f64> {
-        // Summed by size and not by the cameras' names, so that names decide no rounding: a nearly
-        // singular matrix magnifies it.
-        let sum = |mut parts: Vec<Matrix6<f64>>| -> Matrix6<f64> {
-            parts.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
-            parts.iter().sum()
-        };
         let of_cameras = self.ties.iter().map(|(name, ties)| self.considered_part(name, ties));
         // P >= sum of X_k X_k' for independent errors of unit variance.
-        let considered = sum(of_cameras.collect());
+        let considered = sum_by_size(of_cameras.collect());
         match self.learnt_part() {
             Some(learnt) => considered + learnt,
             None => {
                 self.forget_all();
-                sum(self.ties.values().map(|t| t.covariance * t.covariance.transpose()).collect())
+                let all = self.ties.values().map(|t| t.covariance * t.covariance.transpose());
+                sum_by_size(all.collect())
             }
         }
     }
@@ -411,4 +405,17 @@ impl Track {
         let half = own.cholesky()?.l().solve_lower_triangular(&tied.transpose())?;
         Some((half.transpose() * half).fixed_view::<6, 6>(0, 0).into_owned())
     }
+}
+
+/// Whether nothing is left of what was learnt of a camera's errors: it has been silent for too
+/// long.
+fn has_forgotten(ties: &Ties, now: Timestamp) -> bool {
+    ties.silent_s(now).is_none_or(|silent_s| silent_s > FORGOTTEN * ties.lasting_s)
+}
+
+/// The sum by size and not by the cameras' names, so that names decide no rounding: a nearly
+/// singular matrix magnifies it.
+fn sum_by_size(mut parts: Vec<Matrix6<f64>>) -> Matrix6<f64> {
+    parts.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
+    parts.iter().sum()
 }

@@ -9,6 +9,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2x5, Matrix6, Matrix6x2, Vector6};
 
 use super::Track;
+use super::ties::Rescaling;
 use crate::motion::MotionSetup;
 use crate::uncertainty::{LASTING, SharedTies};
 use crate::update::Told;
@@ -236,13 +237,13 @@ impl Track {
         }
     }
 
-    /// ... and that `N` of them, from `first` on, have `ratio` times their variance; the ties
-    /// become `scale` times what they were. `with_now` is the present state's tie to these errors.
+    /// ... and that `N` of them, from `first` on, have another variance. `with_now` is the present
+    /// state's tie to these errors.
     pub(super) fn rescale_past<const N: usize>(
         &mut self,
         camera: &CameraName,
         first: usize,
-        (ratio, scale): (f64, f64),
+        Rescaling { ratio, scale }: Rescaling,
         with_now: &nalgebra::SMatrix<f64, 6, N>,
     ) {
         for past in self.open_past() {

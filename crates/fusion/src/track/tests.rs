@@ -77,29 +77,58 @@ impl LastingErrors {
         Self { noise, errors }
     }
 
-    /// The next bearing of a camera, `interval_s` after its last.
+    /// The next bearing of a camera, [`FRAME_S`] after its last.
     fn line(
         &mut self,
         camera: usize,
         target: Point3<f64>,
-        (time_s, interval_s): (f64, f64),
+        time_s: f64,
         normal: &mut impl FnMut() -> f64,
     ) -> TimedLine {
-        let kept = (-interval_s / self.noise.time_s).exp();
+        let kept = (-FRAME_S / self.noise.time_s).exp();
         let new = (1.0 - kept * kept).sqrt() * self.noise.sd_rad;
         let error = &mut self.errors[camera];
         *error = *error * kept + Vector2::new(normal(), normal()) * new;
         let mut timed = line_at(orthogonal_cameras()[camera], target, time_s);
         let white = Vector2::new(normal(), normal()) * WHITE_RAD;
-        let off = timed.line.basis * (*error + white);
-        timed.line.direction = Unit::new_normalize(timed.line.direction.into_inner() + off);
-        timed.line.basis = tangent_basis(&timed.line.direction);
+        turn(&mut timed.line, *error + white);
         timed.line.covariance = Matrix2::identity() * WHITE_RAD.powi(2);
         timed
     }
 }
 
 const WHITE_RAD: f64 = 2e-5;
+const FRAME_S: f64 = 1.0 / 30.0;
+
+/// Turns a line by an offset along its tangents, rad.
+fn turn(line: &mut SightLine, by: Vector2<f64>) {
+    let off = line.basis * by;
+    line.direction = Unit::new_normalize(line.direction.into_inner() + off);
+    line.basis = tangent_basis(&line.direction);
+}
+
+/// A jump of camera 0's bearings.
+#[derive(Clone, Copy)]
+struct Jump {
+    from_s: f64,
+    by: Vector2<f64>,
+}
+
+impl Jump {
+    const NONE: Self = Self { from_s: f64::INFINITY, by: Vector2::new(0.0, 0.0) };
+}
+
+/// Moves a target on by a time, s, under white acceleration of a density: by its exact moments.
+fn push(target: &mut Vector6<f64>, density: f64, step: f64, normal: &mut impl FnMut() -> f64) {
+    for axis in 0..3 {
+        let [first, second] = [normal(), normal()];
+        let velocity = (density * step).sqrt() * first;
+        target[axis] += target[axis + 3] * step
+            + velocity * step / 2.0
+            + (density * step.powi(3) / 12.0).sqrt() * second;
+        target[axis + 3] += velocity;
+    }
+}
 
 /// A state's error, and its NEES.
 fn erring(state: &KinematicState, truth: &Vector6<f64>) -> (Vector6<f64>, f64) {
@@ -109,15 +138,13 @@ fn erring(state: &KinematicState, truth: &Vector6<f64>) -> (Vector6<f64>, f64) {
 
 /// Errors of position and velocity with their NEES, of the present state and of the smoothed one
 /// half a second before, for a target that is driven by white acceleration for six seconds. A
-/// tentative track considers the lasting errors, a confirmed one learns them. `hand` is a jump of
-/// camera 0's bearings from a time on, rad.
+/// tentative track considers the lasting errors, a confirmed one learns them.
 fn flown(
     status: TrackStatus,
-    (hand_from_s, hand): (f64, Vector2<f64>),
+    jump: Jump,
     normal: &mut impl FnMut() -> f64,
 ) -> [(Vector6<f64>, f64); 2] {
     const DENSITY: f64 = 0.5;
-    const FRAME_S: f64 = 1.0 / 30.0;
     let tracking = Tracking {
         manoeuvres: Manoeuvres::None,
         acceleration_density: DENSITY,
@@ -145,22 +172,12 @@ fn flown(
     let step = FRAME_S / 3.0;
     let mut before = (start, truth);
     for k in 0..540 {
-        // Exact moments of white acceleration over a step.
-        for axis in 0..3 {
-            let [first, second] = [normal(), normal()];
-            let velocity = (DENSITY * step).sqrt() * first;
-            truth[axis] += truth[axis + 3] * step
-                + velocity * step / 2.0
-                + (DENSITY * step.powi(3) / 12.0).sqrt() * second;
-            truth[axis + 3] += velocity;
-        }
+        push(&mut truth, DENSITY, step, normal);
         let (camera, time_s) = (k % 3, f64::from(u32::try_from(k + 1).unwrap()) * step);
         let place = Point3::from(truth.fixed_rows::<3>(0).into_owned());
-        let mut timed = errors.line(camera, place, (100.0 + time_s, FRAME_S), normal);
-        if camera == 0 && time_s > hand_from_s {
-            let off = timed.line.basis * hand;
-            timed.line.direction = Unit::new_normalize(timed.line.direction.into_inner() + off);
-            timed.line.basis = tangent_basis(&timed.line.direction);
+        let mut timed = errors.line(camera, place, 100.0 + time_s, normal);
+        if camera == 0 && time_s > jump.from_s {
+            turn(&mut timed.line, jump.by);
         }
         let bearing = TrackBearing {
             camera: &names[camera],
@@ -192,7 +209,7 @@ fn errors_that_last_are_learnt_and_the_velocity_is_better_known_by_it() {
         let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
         let (mut nees, mut squares) = ([0.0; 2], [0.0; 2]);
         for _ in 0..RUNS {
-            let flown = flown(status, (f64::INFINITY, Vector2::zeros()), &mut normal);
+            let flown = flown(status, Jump::NONE, &mut normal);
             for (k, (error, squared)) in flown.into_iter().enumerate() {
                 nees[k] += squared / f64::from(RUNS);
                 squares[k] += error.fixed_rows::<3>(3).norm_squared() / f64::from(RUNS);
@@ -225,14 +242,14 @@ fn an_error_that_is_drawn_anew_is_no_motion() {
     const RUNS: u32 = 100;
     let mut rng = ChaCha8Rng::seed_from_u64(8);
     let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
-    let mut velocity = |hand: (f64, Vector2<f64>)| {
-        let runs = (0..RUNS).map(|_| flown(TrackStatus::Confirmed, hand, &mut normal)[0].0);
+    let mut velocity = |jump: Jump| {
+        let runs = (0..RUNS).map(|_| flown(TrackStatus::Confirmed, jump, &mut normal)[0].0);
         let square: f64 = runs.map(|error| error.fixed_rows::<3>(3).norm_squared()).sum();
         (square / f64::from(RUNS)).sqrt()
     };
-    let calm = velocity((f64::INFINITY, Vector2::zeros()));
+    let calm = velocity(Jump::NONE);
     // A jump by three deviations in the camera's last bearing: taken for motion, it would double
     // the error.
-    let moved = velocity((5.97, Vector2::new(9e-4, 0.0)));
+    let moved = velocity(Jump { from_s: 5.97, by: Vector2::new(9e-4, 0.0) });
     assert!(moved < 1.3 * calm, "{moved} {calm}");
 }

@@ -14,8 +14,17 @@ use super::{BearingInnovation, Track, TrackBearing};
 use crate::cameras::{ClockChange, RecentBearings, ScaleSample, ThirdDifferences};
 use crate::motion::MotionSetup;
 use crate::uncertainty::{CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies};
-use crate::update::{Told, Updated};
+use crate::update::{ModelUpdate, Told, Updated};
 use crate::visibility::Visibility;
+
+/// A change of the variance of errors that a track is tied to.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Rescaling {
+    /// Factor on the variance that was assumed.
+    pub(super) ratio: f64,
+    /// Factor on the ties.
+    pub(super) scale: f64,
+}
 
 /// Longest interval between bearings whose third difference is used, as a share of the holding time
 /// ([`MotionSetup::holding_s`], how long after a bearing its camera still supports the track): over
@@ -297,7 +306,8 @@ impl Track {
     /// Passes on that a camera's pose error variances are `ratio` times what was assumed, and with
     /// them the part of the track's covariance that they cause.
     pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
-        if let Some(change) = self.rescale::<OF_POSE>(camera, 0, (ratio, ratio.sqrt())) {
+        let rescaling = Rescaling { ratio, scale: ratio.sqrt() };
+        if let Some(change) = self.rescale::<OF_POSE>(camera, 0, rescaling) {
             self.imm.add_covariance(&change);
         }
     }
@@ -324,7 +334,8 @@ impl Track {
         self.shift_past(camera, OF_CLOCK, ahead);
         // X <- sqrt(q) X and P <- P + (q - 1) X X' for q < 1; X <- X / sqrt(q) alone for q > 1.
         let scale = ratio.min(ratio.recip()).sqrt();
-        if let Some(change) = self.rescale::<1>(camera, OF_CLOCK, (ratio.min(1.0), scale)) {
+        let rescaling = Rescaling { ratio: ratio.min(1.0), scale };
+        if let Some(change) = self.rescale::<1>(camera, OF_CLOCK, rescaling) {
             self.imm.add_covariance(&change);
         }
     }
@@ -370,8 +381,10 @@ impl Track {
         let lasting = uncertainty.lasting;
         // Weighted with the probabilities after the update; a model whose numbers failed has none.
         let models = results.iter().zip(self.imm.probabilities().iter().copied());
-        let models = models.filter_map(|(result, weight)| Some((result.as_ref()?, weight)));
-        let nis = models.clone().map(|(after, weight)| after.nis * weight).sum();
+        let models = models.filter_map(|(result, probability)| {
+            Some(ModelUpdate { after: result.as_ref()?, probability })
+        });
+        let nis = models.clone().map(|model| model.after.nis * model.probability).sum();
         let told = Told::over(models);
         self.note(camera, self.updated);
         // First all is predicted, then updated; the past states first, as they need the ties before

@@ -8,10 +8,11 @@ use super::{Noted, TrackChange, Tracker};
 use crate::assignment::{Pairing, assign};
 use crate::cameras::Fitting;
 use crate::cameras::KnownCamera;
+use crate::motion::MotionSetup;
 use crate::reacquisition::FOUND_AGAIN_MARGIN;
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::visibility::log_missed;
-use crate::{Exposure, Sighting};
+use crate::{Exposure, Sighting, Tracking};
 
 /// A camera's bearings are not compared with tracks farther from it than this many times the
 /// largest range. With half of it a target loses its bearings before it leaves that range.
@@ -78,34 +79,14 @@ impl Tracker {
             noted
                 .third_differences
                 .extend(taken.filter(|_| sure).and_then(|taken| taken.third_differences));
-            let silent = exposure.time.seconds_since(track.updated) > self.config.coasting_after_s;
-            let detection = self.config.detection_probability;
-            let visible = track.visible_to(&exposure.camera, exposure.time, &self.motion);
-            let missed = log_missed(visible, detection);
-            let seen_since = !sure || track.is_seen_since_look_of(&exposure.camera);
-            let silent = sure && silent;
-            let change = match gain {
-                // No evidence for the target: what one camera alone follows may be anything along
-                // its sight line.
-                Some(_) if sure && !track.is_held() => 0.0,
-                // The gain was counted against a miss, ln(P_D N / clutter) - ln(1 - P_D): the score
-                // wants the first term alone.
-                Some(gain) => gain + missed,
-                // If whatever hides the target hides it from all cameras, a miss is no evidence
-                // against it; when nobody sees it, time decides.
-                None if sees && !silent && seen_since => missed,
-                None => 0.0,
-            };
+            let evidence = Evidence { gain, sees, sure };
+            let change = evidence.score_change(track, exposure, &self.config, &self.motion);
             track.judge(change, MAX_SCORE);
             // A camera misses nothing outside its field of view.
             if gain.is_some() || sees {
-                track.look(
-                    &exposure.camera,
-                    exposure.time,
-                    gain.is_some(),
-                    detection,
-                    &self.motion,
-                );
+                let detection = self.config.detection_probability;
+                let (camera, time) = (&exposure.camera, exposure.time);
+                track.look(camera, time, gain.is_some(), detection, &self.motion);
             }
             if taken.is_some_and(|taken| taken.manoeuvre) {
                 noted.changes.push(TrackChange::new(TrackEventKind::Manoeuvre, *id));
@@ -159,6 +140,46 @@ impl Tracker {
             }
         }
         candidates
+    }
+}
+
+/// What an exposure says of a track.
+struct Evidence {
+    /// Log-likelihood ratio of the track's bearing against clutter, less that of a miss; `None`
+    /// without a bearing.
+    gain: Option<f64>,
+    /// Whether the camera should see the target.
+    sees: bool,
+    /// Whether the track was confirmed before.
+    sure: bool,
+}
+
+impl Evidence {
+    /// By how much it changes the track's score; the track has been updated with its bearing.
+    fn score_change(
+        &self,
+        track: &Track,
+        exposure: &Exposure,
+        config: &Tracking,
+        motion: &MotionSetup,
+    ) -> f64 {
+        let visible = track.visible_to(&exposure.camera, exposure.time, motion);
+        let missed = log_missed(visible, config.detection_probability);
+        let silent_s = exposure.time.seconds_since(track.updated);
+        let silent = self.sure && silent_s > config.coasting_after_s;
+        let seen_since = !self.sure || track.is_seen_since_look_of(&exposure.camera);
+        match self.gain {
+            // No evidence for the target: what one camera alone follows may be anything along its
+            // sight line.
+            Some(_) if self.sure && !track.is_held() => 0.0,
+            // The gain was counted against a miss, ln(P_D N / clutter) - ln(1 - P_D): the score
+            // wants the first term alone.
+            Some(gain) => gain + missed,
+            // If whatever hides the target hides it from all cameras, a miss is no evidence against
+            // it; when nobody sees it, time decides.
+            None if self.sees && !silent && seen_since => missed,
+            None => 0.0,
+        }
     }
 }
 

@@ -89,24 +89,15 @@ impl Tracker {
     /// Compares each young track a few times with the older ones: a detector that reports the two
     /// ends of a target makes two tracks.
     pub(super) fn prove(&mut self, now: Timestamp, cameras: &Cameras) -> Vec<TrackChange> {
-        let is_due = |track: &&Track| {
-            let next_s = f64::from(track.comparisons + 1) * COMPARED_EVERY_S;
-            track.status == TrackStatus::Confirmed
-                && track.comparisons < COMPARISONS
-                && now.seconds_since(track.born) >= next_s
-        };
-        let due: Vec<TrackId> = self.tracks.values().filter(is_due).map(|track| track.id).collect();
+        let due = self.tracks.values().filter(|track| is_comparison_due(track, now));
+        let due: Vec<TrackId> = due.map(|track| track.id).collect();
         let mut changes = Vec::new();
         for id in due {
             let older = self.tracks.range(..id).map(|(_, old)| old);
             let mut older = older.filter(|old| old.status == TrackStatus::Confirmed);
-            // They must also be together a moment later: two targets that only cross part again.
-            let stays = |old: &Track, new: &Track| {
-                [0.0, COMPARED_EVERY_S]
-                    .iter()
-                    .all(|&s| is_one_image(old, new, now.plus_seconds(s), cameras))
-            };
-            let same = self.tracks.get(&id).and_then(|new| older.find(|old| stays(old, new)));
+            let new = self.tracks.get(&id);
+            let same =
+                new.and_then(|new| older.find(|old| stays_one_image(old, new, now, cameras)));
             let same = same.map(|old| old.id);
             if let Some(track) = self.tracks.get_mut(&id) {
                 track.comparisons += 1;
@@ -180,6 +171,20 @@ impl Tracker {
         self.tracks.insert(id, track);
         changes
     }
+}
+
+/// Whether a young track is to be compared with the older ones once more.
+fn is_comparison_due(track: &Track, now: Timestamp) -> bool {
+    let next_s = f64::from(track.comparisons + 1) * COMPARED_EVERY_S;
+    track.status == TrackStatus::Confirmed
+        && track.comparisons < COMPARISONS
+        && now.seconds_since(track.born) >= next_s
+}
+
+/// Whether two tracks are one image ([`is_one_image`]) now and a moment later: two targets that
+/// only cross part again.
+fn stays_one_image(old: &Track, new: &Track, now: Timestamp, cameras: &Cameras) -> bool {
+    [0.0, COMPARED_EVERY_S].iter().all(|&s| is_one_image(old, new, now.plus_seconds(s), cameras))
 }
 
 /// Whether two tracks lie so close together at a time, for every camera that sees the new one, that

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector, Point3, Vector3};
 
 use crate::common::{Eye, Path, SD_RAD, Scene};
-use crate::tally::Clock;
+use crate::tally::{Clock, PoseSd};
 
 /// Length of a piece of a turning way, s.
 const PIECE_S: f64 = 0.5;
@@ -52,8 +52,8 @@ impl Way {
 }
 
 /// The least standard deviation, s (root mean square over these clocks), with which their offsets
-/// at the end of a scene of one target can be known, where poses are known to (rad, m).
-pub fn bound(scene: &Scene, clocks: &[Clock], pose_sd: (f64, f64), way: Way) -> f64 {
+/// at the end of a scene of one target can be known, where poses are known to this.
+pub fn bound(scene: &Scene, clocks: &[Clock], pose_sd: PoseSd, way: Way) -> f64 {
     let (path, end) = (&scene.paths[0], scene.time_s.end);
     let way_end = 3 * way.coefficients(end);
     let clocks_end = way_end + 2 * clocks.len();
@@ -65,7 +65,8 @@ pub fn bound(scene: &Scene, clocks: &[Clock], pose_sd: (f64, f64), way: Way) -> 
         information[(way_end + 2 * i + 1, way_end + 2 * i + 1)] = DRIFT_SD.powi(-2);
     }
     for i in clocks_end..n {
-        let sd = if (i - clocks_end) % 6 < 3 { pose_sd.0 } else { pose_sd.1 };
+        let is_rotation = (i - clocks_end) % 6 < 3;
+        let sd = if is_rotation { pose_sd.rotation_sd } else { pose_sd.position_sd };
         information[(i, i)] = sd.max(1e-9).powi(-2);
     }
     for start in 0..(way_end / 3).saturating_sub(3) {

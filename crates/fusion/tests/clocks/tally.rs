@@ -92,6 +92,15 @@ fn clock_of(fusion: &Fusion, camera: &str) -> Option<ClockEstimate> {
     fusion.cameras().find(|report| report.camera.as_str() == camera)?.clock
 }
 
+/// Standard deviations of poses.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct PoseSd {
+    /// Of the rotation, rad per axis.
+    pub rotation_sd: f64,
+    /// Of the position, m per axis.
+    pub position_sd: f64,
+}
+
 /// What a series of flights has shown.
 #[derive(Clone, Debug, Default)]
 pub struct Tally {
@@ -110,9 +119,8 @@ pub struct Tally {
     pub excluded: u64,
     /// Latest time at which a clock was not settled, s, of each flight.
     pub settled: Vec<f64>,
-    /// Standard deviations of the cameras' poses, rad and m per axis: calibrations are off by these,
-    /// and say so.
-    pub pose_sd: (f64, f64),
+    /// How far the cameras' poses are off: calibrations say so.
+    pub pose_sd: PoseSd,
     /// Standard deviation of what lasts of the bearings' errors, rad per axis. It counts in the
     /// covariances, but nobody says that it lasts.
     lasting_sd: f64,
@@ -129,7 +137,7 @@ fn root_mean(squares: impl Iterator<Item = f64>) -> f64 {
 impl Tally {
     /// A series of flights before cameras whose poses are off.
     pub fn of_wrong_poses(rotation_sd: f64, position_sd: f64) -> Self {
-        Self { pose_sd: (rotation_sd, position_sd), ..Self::default() }
+        Self { pose_sd: PoseSd { rotation_sd, position_sd }, ..Self::default() }
     }
 
     /// A series of flights whose bearings err by as much, rad per axis, for a second or so.
@@ -203,7 +211,7 @@ impl Tally {
 
     /// Calibrates the cameras anew, with poses that are wrong.
     fn knock(&self, fusion: &mut Fusion, scene: &Scene, seed: u64) {
-        let (rotation_sd, position_sd) = self.pose_sd;
+        let PoseSd { rotation_sd, position_sd } = self.pose_sd;
         if rotation_sd <= 0.0 {
             return;
         }

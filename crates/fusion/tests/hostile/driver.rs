@@ -57,10 +57,10 @@ const JUMPS: [i64; 12] = [
 ];
 /// Clutter bearings that a run may have in all, and those of a frame that are all alike: a fuzzer
 /// must get on. Whatever there are, a period takes a few tenths of a second.
-const MOST_CLUTTER: usize = 6_000;
-const MOST_ALIKE: usize = 200;
+const MAX_CLUTTER: usize = 6_000;
+const MAX_ALIKE: usize = 200;
 /// Operations of a run.
-const MOST_OPERATIONS: usize = 60;
+const MAX_OPERATIONS: usize = 60;
 
 /// An input that ends with this has an appendix before it, of what older inputs do not have: they
 /// mean what they meant.
@@ -426,7 +426,7 @@ impl Run<'_> {
     fn clutter(&mut self) {
         let (eye, wanted, seed) =
             (self.bytes.below(4), self.bytes.below(256) * 8, self.bytes.next());
-        let most = if seed & 1 == 0 { MOST_ALIKE } else { wanted };
+        let most = if seed & 1 == 0 { MAX_ALIKE } else { wanted };
         let count = wanted.min(self.clutter_left).min(most);
         self.clutter_left -= count;
         let mut state = u64::from(seed);
@@ -632,7 +632,7 @@ pub fn drive(data: &[u8]) {
     let mut run = Run {
         bytes,
         fusion,
-        clutter_left: MOST_CLUTTER,
+        clutter_left: MAX_CLUTTER,
         lines_are_owned,
         is_appended,
         time: 0,
@@ -648,7 +648,7 @@ pub fn drive(data: &[u8]) {
         frames_out: 0,
         smoothed_out: 0,
     };
-    for _ in 0..MOST_OPERATIONS {
+    for _ in 0..MAX_OPERATIONS {
         if run.bytes.0.is_empty() {
             break;
         }

@@ -24,8 +24,8 @@ use crate::cameras::{KnownCamera, Rooted};
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::spatial::TimedLine;
-use crate::track::{Track, TrackId, TrackStatus};
-use crate::tracker::same_target;
+use crate::track::{Track, TrackStatus};
+use crate::tracker::{UsedSighting, same_target};
 use crate::{Exposure, FusionConfig};
 
 /// A reading is confirmed if one target is likelier by this log-likelihood ratio than each camera
@@ -101,11 +101,10 @@ impl Handover {
             let of =
                 Cued { track_id: 0, camera: camera.to_string(), image_track_id: one.image_track };
             let seen_from = Some(one.line.line.origin);
-            let expected = |time: Timestamp| {
+            Some(CueTarget::new(of, now, seen_from, |time| {
                 let ahead_s = time.seconds_since(one.sight.time);
                 state.predicted(ahead_s, TURNING_DENSITY * range.powi(2))
-            };
-            Some(CueTarget::new(of, now, seen_from, expected))
+            }))
         });
         known.collect()
     }
@@ -115,12 +114,12 @@ impl Handover {
     pub(super) fn see(
         &mut self,
         exposure: &Exposure,
-        used: &[(usize, TrackId)],
+        used: &[UsedSighting],
         known: &KnownCamera,
         motion: &MotionSetup,
     ) -> Vec<Start> {
         let mut is_owned = vec![false; exposure.sightings.len()];
-        used.iter().for_each(|(index, _)| is_owned[*index] = true);
+        used.iter().for_each(|used| is_owned[used.index] = true);
         let context = ReadingContext { exposure, known, motion, is_owned: &is_owned };
         self.forget(exposure.time);
         let begun = self.follow(&context);
@@ -279,17 +278,14 @@ impl Handover {
     /// rivals, unless they give the same target.
     fn settle(&mut self, context: &ReadingContext<'_>) -> Vec<Start> {
         let ReadingContext { exposure, motion, .. } = *context;
-        let is_new = |reading: &Reading| {
-            let (camera, sequence, _) = &reading.newest;
-            *camera == exposure.camera && *sequence == exposure.sequence
-        };
+
         let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
         let all: Vec<&Reading> =
             self.seen.values().flatten().flat_map(|one| &one.readings).collect();
         let mut sure: Vec<&Reading> = all
             .iter()
             .copied()
-            .filter(|one| is_new(one) && one.ratio() >= MARGIN && one.track.is_placed())
+            .filter(|one| one.is_of(exposure) && one.ratio() >= MARGIN && one.track.is_placed())
             .filter(|one| {
                 // Rivals share the newest line or the direction that was followed first.
                 let mut rivals = all.iter().filter(|other| {

@@ -145,6 +145,12 @@ impl Reading {
         Some(())
     }
 
+    /// Whether its newest line is of this exposure.
+    pub(super) fn is_of(&self, exposure: &Exposure) -> bool {
+        let (camera, sequence, _) = &self.newest;
+        *camera == exposure.camera && *sequence == exposure.sequence
+    }
+
     /// Log-likelihood ratio of one target against one target per camera.
     pub(super) fn ratio(&self) -> f64 {
         self.one_target.log_ratio().unwrap_or(f64::NEG_INFINITY)

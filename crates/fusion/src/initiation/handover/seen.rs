@@ -3,9 +3,9 @@
 use std::collections::BTreeSet;
 
 use crossfix_filter::KinematicState;
-use crossfix_geometry::{BearingModel, SightLine, passing_ranges};
+use crossfix_geometry::{BearingModel, Ray, SightLine, passing_ranges};
 use crossfix_message::{CameraName, Solver, Timestamp};
-use nalgebra::{Matrix3, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 use super::super::sight::DirectionFilter;
 use super::Rules;
@@ -116,9 +116,8 @@ impl SeenDirection {
     ) -> Option<Track> {
         let Self { sight, line: last, uncertainty, .. } = self;
         let max_range_m = rules.max_range_m;
-        let by_now = self.at(time).direction;
-        let [range, there] =
-            passing_ranges((last.line.origin, &by_now), (line.origin, &line.direction));
+        let by_now = Ray { origin: last.line.origin, direction: self.at(time).direction };
+        let [range, there] = passing_ranges(by_now, line.ray());
         if ![range, there].iter().all(|range| (f64::MIN_POSITIVE..=max_range_m).contains(range)) {
             return None;
         }
@@ -145,15 +144,13 @@ impl SeenDirection {
         let direction_variance = sight.variance + self.pose_variance;
         let (tie, turning) = (sight.tie, sight.rate_variance);
         let mut covariance = scale * scale.transpose();
-        let mut add = |row: usize, column: usize, block: Matrix3<f64>| {
-            let mut view = covariance.fixed_view_mut::<3, 3>(row, column);
-            view += block;
-        };
         // Across the direction: the filter's covariance of direction and rate times r^2.
-        add(0, 0, across * (direction_variance * range.powi(2)));
-        add(0, 3, across * (tie * range.powi(2)));
-        add(3, 0, across * (tie * range.powi(2)));
-        add(3, 3, across * (turning * range.powi(2)) + along_squared * speed.powi(2));
+        let tied = across * (tie * range.powi(2));
+        add_block(&mut covariance, [0, 0], across * (direction_variance * range.powi(2)));
+        add_block(&mut covariance, [0, 3], tied);
+        add_block(&mut covariance, [3, 0], tied);
+        let turning = across * (turning * range.powi(2)) + along_squared * speed.powi(2);
+        add_block(&mut covariance, [3, 3], turning);
         let mean = stacked(last.line.origin.coords + along * range, velocity);
         Some(KinematicState { mean, covariance })
     }
@@ -163,6 +160,12 @@ impl SeenDirection {
 pub(super) fn pose_variance(with_pose: &TimedLine, exposure: &Exposure, index: usize) -> f64 {
     let own = exposure.sightings[index].line.covariance * exposure.uncertainty.factor;
     (with_pose.line.covariance - own).trace().max(0.0) / 2.0
+}
+
+/// Adds a block to a covariance, from this row and column on.
+fn add_block(to: &mut Matrix6<f64>, [row, column]: [usize; 2], block: Matrix3<f64>) {
+    let mut view = to.fixed_view_mut::<3, 3>(row, column);
+    view += block;
 }
 
 fn stacked(place: Vector3<f64>, velocity: Vector3<f64>) -> Vector6<f64> {
