@@ -73,6 +73,13 @@ impl SiteMove {
         self.middle + self.shift + self.turn * (place - self.middle) * self.size
     }
 
+    /// Angle between a moved target and the second's line of sight, rad.
+    fn angle(&self, sight: &ComparedPixel) -> f64 {
+        let before = self.applied(sight.target) - sight.from;
+        // By the tangent: the cosine cannot resolve angles below 1e-8.
+        before.cross(&sight.direction).norm().atan2(before.dot(&sight.direction))
+    }
+
     /// How far a moved target misses the second's line of sight, in the line's tangents, rad, and
     /// the derivative of that by shift, turn and relative size.
     fn miss(&self, sight: &ComparedPixel) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>)> {
@@ -164,13 +171,15 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
             camera(pair.0, pair.1, sights, &moved, later_s)
         })
         .collect();
-    let names = |site: &SiteCalibration, other: &SiteCalibration| -> Vec<CameraName> {
-        let alone = |camera: &&CalibratedCamera| other.camera(&camera.name).is_none();
-        site.cameras().iter().filter(alone).map(|camera| camera.name.clone()).collect()
-    };
-    let missing = [names(first, second), names(second, first)].concat();
+    let missing = [only_in(first, second), only_in(second, first)].concat();
     let moved = has_move.then_some(SiteMove { later_s: common_s, ..moved });
     Some(SiteComparison { moved, cameras, missing })
+}
+
+/// The cameras of a calibration that another one does not have.
+fn only_in(site: &SiteCalibration, other: &SiteCalibration) -> Vec<CameraName> {
+    let alone = |camera: &&CalibratedCamera| other.camera(&camera.name).is_none();
+    site.cameras().iter().filter(alone).map(|camera| camera.name.clone()).collect()
 }
 
 /// The pixels that both calibrations have a direction for.
@@ -180,20 +189,22 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<ComparedPixel
 }
 
 fn sight(one: &CalibratedCamera, other: &CalibratedCamera, pixel: Pixel) -> Option<ComparedPixel> {
-    let direction = |camera: &CalibratedCamera| {
-        let own = camera.camera.model().direction(pixel).ok()?;
-        Some(Unit::new_normalize(camera.camera.pose().rotation() * own.into_inner()))
-    };
     let said = |camera: &CalibratedCamera| camera.pointing_sd_rad(pixel, one.range_m);
-    let target = direction(one)?.into_inner() * one.range_m;
+    let target = direction(one, pixel)?.into_inner() * one.range_m;
     Some(ComparedPixel {
         pixel,
         target: one.camera.pose().position() + target,
         from: other.camera.pose().position(),
-        direction: direction(other)?,
+        direction: direction(other, pixel)?,
         // The calibrations' errors are taken to be independent: their variances add.
         said_rad: said(one)?.hypot(said(other)?).max(LEAST_SAID_RAD),
     })
+}
+
+/// A pixel's direction in the world.
+fn direction(camera: &CalibratedCamera, pixel: Pixel) -> Option<Unit<Vector3<f64>>> {
+    let own = camera.camera.model().direction(pixel).ok()?;
+    Some(Unit::new_normalize(camera.camera.pose().rotation() * own.into_inner()))
 }
 
 /// The similarity that brings the first's targets nearest to the second's lines of sight, in
@@ -240,11 +251,6 @@ fn camera(
     moved: &SiteMove,
     later_s: Option<f64>,
 ) -> CameraComparison {
-    // By the tangent: the cosine cannot resolve angles below 1e-8.
-    let angle = |sight: &ComparedPixel| {
-        let before = moved.applied(sight.target) - sight.from;
-        before.cross(&sight.direction).norm().atan2(before.dot(&sight.direction))
-    };
     // Root mean square; an angle's square is that of two axes, hence the halves below.
     let mean = |value: &dyn Fn(&ComparedPixel) -> f64| {
         (sights.iter().map(value).sum::<f64>() / sights.len() as f64).sqrt()
@@ -254,10 +260,10 @@ fn camera(
     CameraComparison {
         name: one.name.clone(),
         centre_m: (other.camera.pose().position() - centre).norm(),
-        apart_rad: mean(&|sight| angle(sight).powi(2) / 2.0),
-        most_rad: sights.iter().map(angle).fold(0.0, f64::max),
+        apart_rad: mean(&|sight| moved.angle(sight).powi(2) / 2.0),
+        most_rad: sights.iter().map(|sight| moved.angle(sight)).fold(0.0, f64::max),
         said_rad: mean(&|sight| sight.said_rad.powi(2)),
-        deviations: mean(&|sight| (angle(sight) / sight.said_rad).powi(2) / 2.0),
+        deviations: mean(&|sight| (moved.angle(sight) / sight.said_rad).powi(2) / 2.0),
         focal_ratio: focal(other) / focal(one),
         later_s,
         pixels: sights

@@ -254,12 +254,8 @@ impl FitEquations {
         if energy <= 0.0 || !energy.is_finite() {
             return None;
         }
-        // Linear in (gain, gain dx, gain dy, gain ds, gain dphi): image = gain * (model - dx by_x -
-        // dy by_y - ds by_scale - dphi by_turn). The signs are negative because the model moves
-        // against its slope.
-        let sign = |i: usize| if i == 0 { 1.0 } else { -1.0 };
-        let mut normal = Matrix5::from_fn(|i, j| sign(i) * sign(j) * p[i][j]);
-        let mut right = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
+        let mut normal = Matrix5::from_fn(|i, j| SIGNS[i] * SIGNS[j] * p[i][j]);
+        let mut right = self.by_image();
         // Without scale and turn their rows are empty: any information there keeps the matrix
         // regular.
         let information = normal;
@@ -277,20 +273,8 @@ impl FitEquations {
         let solution = solved.solve(&right);
         let gain = solution[0];
         fit.gain = gain;
-        // Residual sum of squares over the pixels less the fitted parameters and the mean. With the
-        // image r it is r'r - 2 x'J'r + x'J'J x for any x, and r'r - x'J'r for that of least
-        // squares, which it is not where the contrast is given.
-        let fitted = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
-        let parameters = if shift_only { 4.0 } else { 6.0 };
-        let (explained, parameters) = match options.contrast {
-            Some(_) => (
-                2.0 * solution.dot(&fitted) - (information * solution).dot(&solution),
-                parameters - 1.0,
-            ),
-            None => (solution.dot(&fitted), parameters),
-        };
         fit.residual_variance =
-            ((p[5][5] - explained) / (fit.pixels as f64 - parameters).max(1.0)).max(0.0);
+            self.residual_variance(&solution, &information, options, fit.pixels as f64);
         if gain <= 0.0 || !gain.is_finite() {
             return None;
         }
@@ -313,7 +297,39 @@ impl FitEquations {
         let step = [solution[1] / gain, solution[2] / gain];
         (fit.inverse.is_some() && step.iter().all(|s| s.is_finite())).then_some(step)
     }
+
+    /// J'r with the image r.
+    fn by_image(&self) -> Vector5<f64> {
+        Vector5::from_fn(|i, _| SIGNS[i] * self.products[i][5])
+    }
+
+    /// Residual sum of squares over the pixels less the fitted parameters and the mean.
+    fn residual_variance(
+        &self,
+        solution: &Vector5<f64>,
+        information: &Matrix5<f64>,
+        options: FitOptions,
+        pixels: f64,
+    ) -> f64 {
+        let parameters = if options.freedom == Freedom::Shift { 4.0 } else { 6.0 };
+        let fitted = self.by_image();
+        // With the image r the sum is r'r - 2 x'J'r + x'J'J x for any x, and r'r - x'J'r for that
+        // of least squares, which it is not where the contrast is given.
+        let (explained, parameters) = match options.contrast {
+            Some(_) => (
+                2.0 * solution.dot(&fitted) - (information * solution).dot(solution),
+                parameters - 1.0,
+            ),
+            None => (solution.dot(&fitted), parameters),
+        };
+        ((self.products[5][5] - explained) / (pixels - parameters).max(1.0)).max(0.0)
+    }
 }
+
+/// Signs of J's columns. The fit is linear in (gain, gain dx, gain dy, gain ds, gain dphi): image =
+/// gain * (model - dx by_x - dy by_y - ds by_scale - dphi by_turn). They are negative because the
+/// model moves against its slope.
+const SIGNS: [f64; 5] = [1.0, -1.0, -1.0, -1.0, -1.0];
 
 /// The sum of samples, in eight SIMD lanes.
 #[inline(always)]

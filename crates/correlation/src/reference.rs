@@ -21,12 +21,9 @@ impl Window {
     /// A Gaussian around the middle, with a standard deviation of this share of each side: the
     /// target in the middle counts, the background at the border little.
     pub fn gaussian(width: usize, height: usize, share: f64) -> Self {
-        let weight = |index: usize, side: usize| {
-            let distance = (index as f64 - (side as f64 - 1.0) / 2.0) / (share * side as f64);
-            (-0.5 * distance.powi(2)).exp() as f32
-        };
-        let columns = normalised(Plane::from_fn(width, 1, |x, _| weight(x, width)));
-        let rows = normalised(Plane::from_fn(1, height, |_, y| weight(y, height)));
+        let columns = Plane::from_fn(width, 1, |x, _| gaussian_weight(x, width, share));
+        let rows = Plane::from_fn(1, height, |_, y| gaussian_weight(y, height, share));
+        let (columns, rows) = (normalised(columns), normalised(rows));
         Self { columns, rows, uniform: false }
     }
 
@@ -67,6 +64,12 @@ impl Window {
     pub(crate) fn rows(&self) -> &Plane {
         &self.rows
     }
+}
+
+/// The weight of an index along a side, 1 in its middle.
+fn gaussian_weight(index: usize, side: usize, share: f64) -> f32 {
+    let distance = (index as f64 - (side as f64 - 1.0) / 2.0) / (share * side as f64);
+    (-0.5 * distance.powi(2)).exp() as f32
 }
 
 fn normalised(mut plane: Plane) -> Plane {

@@ -152,16 +152,18 @@ impl Outlet for Asterix {
     fn tracks(&mut self, snapshot: &Snapshot) -> Vec<Vec<u8>> {
         let records: Vec<Vec<u8>> =
             snapshot.targets.iter().map(|target| self.record(snapshot.time, target)).collect();
-        let block = |records: &[Vec<u8>]| {
-            // At most 1400 bytes.
-            let length = (HEAD_BYTES + RECORD_BYTES * records.len()) as u16;
-            let mut block = vec![CATEGORY];
-            block.extend(length.to_be_bytes());
-            block.extend(records.iter().flatten());
-            block
-        };
         records.chunks(MOST_RECORDS).map(block).collect()
     }
+}
+
+/// A data block of at most [`MOST_RECORDS`] records.
+fn block(records: &[Vec<u8>]) -> Vec<u8> {
+    // At most 1400 bytes.
+    let length = (HEAD_BYTES + RECORD_BYTES * records.len()) as u16;
+    let mut block = vec![CATEGORY];
+    block.extend(length.to_be_bytes());
+    block.extend(records.iter().flatten());
+    block
 }
 
 /// Assigns each track a number of 16 bits.

@@ -235,21 +235,22 @@ fn fixes_of(snapshot: &crate::Snapshot) -> Vec<FoxgloveMessage> {
     let is_there = |target: &&crate::Target| {
         matches!(target.state, TrackState::Confirmed | TrackState::Coasting)
     };
-    let fix = |target: &crate::Target| {
-        let topic = topic_of(target.id, "location");
-        let covariance = target.covariance.fixed_view::<3, 3>(0, 0).into_owned();
-        let fix = wire::LocationFix {
-            timestamp: stamp(snapshot.time),
-            frame_id: SITE_FRAME.to_owned(),
-            latitude: target.place.latitude_deg(),
-            longitude: target.place.longitude_deg(),
-            altitude: target.place.height(),
-            position_covariance: covariance.transpose().as_slice().to_vec(),
-            position_covariance_type: wire::location_fix::PositionCovarianceType::Known.into(),
-            heading: Some(target.motion().course_deg.value.to_radians()),
-            velocity: Some(vector(target.velocity.into())),
-        };
-        said(topic, snapshot.time, &fix)
+    let there = snapshot.targets.iter().filter(is_there);
+    there.map(|target| fix_of(target, snapshot.time)).collect()
+}
+
+fn fix_of(target: &crate::Target, time: Timestamp) -> FoxgloveMessage {
+    let covariance = target.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+    let fix = wire::LocationFix {
+        timestamp: stamp(time),
+        frame_id: SITE_FRAME.to_owned(),
+        latitude: target.place.latitude_deg(),
+        longitude: target.place.longitude_deg(),
+        altitude: target.place.height(),
+        position_covariance: covariance.transpose().as_slice().to_vec(),
+        position_covariance_type: wire::location_fix::PositionCovarianceType::Known.into(),
+        heading: Some(target.motion().course_deg.value.to_radians()),
+        velocity: Some(vector(target.velocity.into())),
     };
-    snapshot.targets.iter().filter(is_there).map(fix).collect()
+    said(topic_of(target.id, "location"), time, &fix)
 }

@@ -255,12 +255,12 @@ fn mode() -> sapient::registration::ModeDefinition {
     }
 }
 
+fn node(kind: sapient::registration::NodeType) -> sapient::registration::NodeDefinition {
+    sapient::registration::NodeDefinition { node_type: Some(kind.into()), ..Default::default() }
+}
+
 fn registration(site: &SiteName) -> sapient::Registration {
     use sapient::registration as r;
-    let node = |kind: r::NodeType| r::NodeDefinition {
-        node_type: Some(kind.into()),
-        ..Default::default()
-    };
     sapient::Registration {
         node_definition: vec![node(r::NodeType::FusionNode), node(r::NodeType::Camera)],
         icd_version: Some(VERSION.to_owned()),

@@ -174,13 +174,12 @@ impl Situation {
                 known.state = TrackState::Lost;
             }
         }
-        let (frame, datum) = (&self.frame, self.datum.as_ref());
-        let target = |(&id, known): (&u64, &Known)| {
+        let targets = self.tracks.iter().map(|(&id, known)| {
             // A lost target is not predicted: it stays where it was.
             let at = if known.state == TrackState::Lost { known.time } else { time };
-            known.at(at, frame, datum, id)
-        };
-        let targets = self.tracks.iter().map(target).collect();
+            known.at(at, &self.frame, self.datum.as_ref(), id)
+        });
+        let targets = targets.collect();
         self.tracks.retain(|_, known| known.state != TrackState::Lost);
         Some(Snapshot { site: self.site.clone(), time, targets })
     }

@@ -15,7 +15,7 @@ use crate::{CHANNELS, Damage, Entry, RecordingError, Source};
 /// Damaged records may claim bytes that belong to other records, so that these bytes are read
 /// again: in total at most this many times the size of the file. With half of it the rest of a
 /// badly damaged file is given up sooner; with twice as much a hostile one takes twice as long.
-const MOST_READINGS: u64 = 16;
+const MAX_READINGS: u64 = 16;
 
 /// Result of reading a recording: what it held, and what could not be read.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -193,7 +193,7 @@ impl<R: Read + Seek> RecordingReader<R> {
         }
         self.at = resumed;
         // The rest of a file is given up if it was made to have everything in it read many times.
-        if self.spent > self.size.saturating_mul(MOST_READINGS) {
+        if self.spent > self.size.saturating_mul(MAX_READINGS) {
             self.note(self.at, self.size - self.at, "it is damaged in too many places");
             self.at = self.size;
         }

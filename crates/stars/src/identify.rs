@@ -65,29 +65,15 @@ impl Sky {
         let width = pattern_width(lens);
         let half = (width / 2.0).tan();
         let size = lens.intrinsics().size;
-        let half_height = half * f64::from(size.height) / f64::from(size.width);
-        // Pinhole coordinates of focal length one; the sides of a wide lens are left out.
-        let seen: Vec<(usize, Vector3<f64>)> = spots
-            .iter()
-            .enumerate()
-            .filter_map(|(index, spot)| {
-                Some((index, lens.direction(spot.pixel).ok()?.into_inner()))
-            })
-            .filter(|(_, direction)| direction.z > 0.0)
-            .map(|(index, direction)| (index, direction / direction.z))
-            .filter(|(_, plane)| plane.x.abs() <= half && plane.y.abs() <= half_height)
-            .collect();
+        let seen = in_plane(spots, lens, half);
         if seen.len() < FEWEST_SPOTS {
             return Err(StarError::TooFew { found: seen.len(), needed: FEWEST_SPOTS });
         }
         let focal = f64::from(size.width) / 2.0 / half;
-        let centroid = |(index, plane): &(usize, Vector3<f64>)| Centroid {
-            x: (plane.x * focal) as f32,
-            y: (plane.y * focal) as f32,
-            mass: Some(spots[*index].brightness as f32),
-            cov: None,
-        };
-        let centroids: Vec<Centroid> = seen.iter().map(centroid).collect();
+        let centroids: Vec<Centroid> = seen
+            .iter()
+            .map(|(index, plane)| centroid(plane * focal, spots[*index].brightness))
+            .collect();
         let config = SolveConfig {
             fov_max_error_rad: Some((width * SCALE_SHARE) as f32),
             match_radius: MATCH_SHARE,
@@ -130,13 +116,12 @@ impl Sky {
         gate_px: impl Fn(Pixel) -> f64,
     ) -> Vec<NamedStar> {
         let faintest = self.faintest_of(spots.len(), camera);
-        let camera_from_world = camera.pose().rotation().inverse();
         let seen: Vec<(&Star, Pixel, f64)> = self
             .stars
             .iter()
             .filter(|star| star.direction.z > LOWEST_SINE && star.magnitude < faintest)
             .filter_map(|star| {
-                let direction = camera_from_world * star.direction.into_inner();
+                let direction = star.direction_from(camera);
                 let is_seen = camera.model().sees(&direction);
                 let at = is_seen.then(|| camera.model().project(&direction)).flatten()?;
                 Some((star, at, gate_px(at)))
@@ -160,17 +145,38 @@ impl Sky {
 
     /// The magnitude of the faintest star that a camera can be seeing if it sees `count` spots.
     fn faintest_of(&self, count: usize, camera: &Camera) -> f64 {
-        let camera_from_world = camera.pose().rotation().inverse();
-        let is_seen = |star: &&Star| {
-            star.direction.z > LOWEST_SINE
-                && camera.model().sees(&(camera_from_world * star.direction.into_inner()))
-        };
-        let last = self.stars.iter().filter(is_seen).take(count.max(1)).last();
+        let stars = self.stars.iter().filter(|star| star.direction.z > LOWEST_SINE);
+        let seen = stars.filter(|star| camera.model().sees(&star.direction_from(camera)));
+        let last = seen.take(count.max(1)).last();
         last.map_or(f64::INFINITY, |star| star.magnitude + FAINTER)
     }
 }
 
+/// Spots in pinhole coordinates of focal length one, each with its index; the sides of a wide lens
+/// are left out: what lies beyond `half` of the width.
+fn in_plane(spots: &[Spot], lens: &CameraModel, half: f64) -> Vec<(usize, Vector3<f64>)> {
+    let size = lens.intrinsics().size;
+    let half_height = half * f64::from(size.height) / f64::from(size.width);
+    spots
+        .iter()
+        .enumerate()
+        .filter_map(|(index, spot)| Some((index, lens.direction(spot.pixel).ok()?.into_inner())))
+        .filter(|(_, direction)| direction.z > 0.0)
+        .map(|(index, direction)| (index, direction / direction.z))
+        .filter(|(_, plane)| plane.x.abs() <= half && plane.y.abs() <= half_height)
+        .collect()
+}
+
+fn centroid(plane: Vector3<f64>, brightness: f64) -> Centroid {
+    Centroid { x: plane.x as f32, y: plane.y as f32, mass: Some(brightness as f32), cov: None }
+}
+
 impl Star {
+    /// Its direction in a camera's frame.
+    fn direction_from(&self, camera: &Camera) -> Vector3<f64> {
+        camera.pose().rotation().inverse() * self.direction.into_inner()
+    }
+
     fn named(&self, spot: &Spot) -> NamedStar {
         NamedStar { name: self.name.clone(), pixel: spot.pixel, direction: self.direction }
     }

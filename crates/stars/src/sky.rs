@@ -6,6 +6,7 @@ use crossfix_geometry::{CameraModel, Pixel};
 use nalgebra::{Unit, Vector3};
 use tetra3::{GenerateDatabaseConfig, SolverDatabase};
 
+use crate::observer::Prepared;
 use crate::{Observer, StarError};
 
 /// A star as it is seen.
@@ -79,12 +80,8 @@ impl Sky {
         let path = catalogue.to_str().ok_or_else(|| wrong("its name is not UTF-8".to_owned()))?;
         let database = SolverDatabase::generate_from_gaia(path, &config)
             .map_err(|error| wrong(error.to_string()))?;
-        let star = |star: &tetra3::Star| Star {
-            name: name(star.id),
-            magnitude: f64::from(star.mag),
-            direction: prepared.direction(f64::from(star.ra_rad), f64::from(star.dec_rad)),
-        };
-        let stars: Vec<Star> = database.star_catalog.stars().iter().map(star).collect();
+        let catalogued = database.star_catalog.stars().iter();
+        let stars: Vec<Star> = catalogued.map(|star| Star::seen(star, &prepared)).collect();
         if stars.is_empty() {
             return Err(wrong("it has no stars".to_owned()));
         }
@@ -94,6 +91,16 @@ impl Sky {
     /// The stars, brightest first.
     pub fn stars(&self) -> &[Star] {
         &self.stars
+    }
+}
+
+impl Star {
+    fn seen(star: &tetra3::Star, observer: &Prepared) -> Self {
+        Self {
+            name: name(star.id),
+            magnitude: f64::from(star.mag),
+            direction: observer.direction(f64::from(star.ra_rad), f64::from(star.dec_rad)),
+        }
     }
 }
 

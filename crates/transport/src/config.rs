@@ -45,6 +45,14 @@ pub struct Area {
     pub cameras: Vec<CameraName>,
 }
 
+impl Area {
+    /// Whether it names fewer than two cameras, or one of them twice.
+    fn has_too_few_cameras(&self) -> bool {
+        let distinct: BTreeSet<&CameraName> = self.cameras.iter().collect();
+        distinct.len() < self.cameras.len() || distinct.len() < 2
+    }
+}
+
 /// The network of a site: a name and the endpoints of all components.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -274,11 +282,7 @@ impl NetworkConfig {
             let camera = of.cameras.iter().find(|camera| !self.cameras.contains_key(camera))?;
             Some(NetworkError::CameraOfArea { area: area.clone(), camera: camera.clone() })
         });
-        let are_too_few = |(_, of): &(&AreaName, &Area)| {
-            let distinct: BTreeSet<&CameraName> = of.cameras.iter().collect();
-            distinct.len() < of.cameras.len() || distinct.len() < 2
-        };
-        let too_few = self.areas.iter().find(are_too_few);
+        let too_few = self.areas.iter().find(|(_, of)| of.has_too_few_cameras());
         let too_few = too_few.map(|(area, _)| NetworkError::CamerasOfArea(area.clone()));
         let unheard =
             |camera: &&CameraName| !self.areas.is_empty() && self.heard_by(camera).is_empty();

@@ -3,7 +3,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use crossfix_message::Key;
 use zenoh::pubsub::Subscriber;
-use zenoh::sample::SampleKind;
+use zenoh::sample::{Sample, SampleKind};
 
 /// Most components that are tracked; more is an attack. With half of it the same.
 const MAX_COMPONENTS: usize = 10_000;
@@ -21,24 +21,13 @@ impl Presence {
     pub(crate) fn watch(session: &zenoh::Session, expressions: &[String]) -> zenoh::Result<Self> {
         use zenoh::Wait;
         let alive = Alive::default();
-        let watch = |expression: &String| {
+        let mut subscribers = Vec::new();
+        for expression in expressions {
             let heard = Arc::clone(&alive);
-            // Runs on Zenoh's receiving thread.
-            let note = move |sample: zenoh::sample::Sample| {
-                let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
-                    return;
-                };
-                let mut alive = heard.lock().unwrap_or_else(PoisonError::into_inner);
-                match sample.kind() {
-                    SampleKind::Put if alive.len() < MAX_COMPONENTS => alive.insert(key),
-                    SampleKind::Put => false,
-                    SampleKind::Delete => alive.remove(&key),
-                };
-            };
             let liveliness = session.liveliness();
-            liveliness.declare_subscriber(expression).history(true).callback(note).wait()
-        };
-        let subscribers = expressions.iter().map(watch).collect::<zenoh::Result<Vec<_>>>()?;
+            let subscriber = liveliness.declare_subscriber(expression).history(true);
+            subscribers.push(subscriber.callback(move |sample| note(&heard, &sample)).wait()?);
+        }
         Ok(Self { alive, _subscribers: Arc::new(subscribers) })
     }
 
@@ -46,4 +35,17 @@ impl Presence {
     pub fn is_alive(&self, key: &Key) -> bool {
         self.alive.lock().unwrap_or_else(PoisonError::into_inner).contains(key)
     }
+}
+
+/// Notes that a component has come or gone. Runs on Zenoh's receiving thread.
+fn note(alive: &Alive, sample: &Sample) {
+    let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
+        return;
+    };
+    let mut alive = alive.lock().unwrap_or_else(PoisonError::into_inner);
+    match sample.kind() {
+        SampleKind::Put if alive.len() < MAX_COMPONENTS => alive.insert(key),
+        SampleKind::Put => false,
+        SampleKind::Delete => alive.remove(&key),
+    };
 }

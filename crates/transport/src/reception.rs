@@ -83,13 +83,17 @@ impl Reception {
 
     /// The keys on which two runs take turns now, each with the two runs heard most recently.
     pub fn rivals(&self, now: Instant) -> Vec<(&Key, [RunId; 2])> {
-        let rival = |(key, senders)| {
-            let Senders { runs, took_turns }: &Senders = senders;
-            took_turns.filter(|then| now.saturating_duration_since(*then) < RIVALRY)?;
-            let [.., (one, _), (other, _)] = runs[..] else { return None };
-            Some((key, [one, other]))
-        };
-        self.keys.iter().filter_map(rival).collect()
+        let keys = self.keys.iter();
+        keys.filter_map(|(key, senders)| Some((key, senders.rivals(now)?))).collect()
+    }
+}
+
+impl Senders {
+    /// The two runs heard most recently, if runs take turns now.
+    fn rivals(&self, now: Instant) -> Option<[RunId; 2]> {
+        self.took_turns.filter(|then| now.saturating_duration_since(*then) < RIVALRY)?;
+        let [.., (one, _), (other, _)] = self.runs[..] else { return None };
+        Some([one, other])
     }
 }
 

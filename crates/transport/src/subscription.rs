@@ -28,6 +28,15 @@ pub struct Received {
     pub at: Instant,
 }
 
+impl Received {
+    fn of(key: Key, sample: &Sample) -> Self {
+        let origin = sample.attachment().and_then(|bytes| Origin::from_bytes(&bytes.to_bytes()));
+        // Copied: otherwise a payload of a few bytes would keep the transport's whole buffer alive.
+        let data = sample.payload().to_bytes().into_owned();
+        Self { key, data, origin, at: Instant::now() }
+    }
+}
+
 /// Counts of messages that a subscription did not hand on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RefusedCounts {
@@ -84,16 +93,7 @@ impl Intake {
         }
         let before = self.counts.waiting_bytes.fetch_add(length, Ordering::Relaxed);
         let fits = before + length <= MAX_WAITING_BYTES;
-        let origin = || Origin::from_bytes(&sample.attachment()?.to_bytes());
-        let received = || Received {
-            key,
-            // Copied: otherwise a payload of a few bytes would keep the transport's whole buffer
-            // alive.
-            data: sample.payload().to_bytes().into_owned(),
-            origin: origin(),
-            at: Instant::now(),
-        };
-        if !fits || self.sender.try_send(received()).is_err() {
+        if !fits || self.sender.try_send(Received::of(key, sample)).is_err() {
             self.counts.waiting_bytes.fetch_sub(length, Ordering::Relaxed);
             self.counts.dropped.fetch_add(1, Ordering::Relaxed);
         }

@@ -139,18 +139,20 @@ fn unreadable(parameters: &SeqParameterSet) -> Option<String> {
 /// slice).
 fn builds_on_later(unit: &[u8]) -> bool {
     let is_slice = unit.first().is_some_and(|head| matches!(head & 0x1f, 1 | 5));
-    let mut bits = unit.iter().skip(1).flat_map(|byte| (0..8).rev().map(move |n| byte >> n & 1));
-    // Two numbers in Exp-Golomb code: where the slice begins, and its type (H.264, 7.3.3 and 9.1).
-    let mut number = || {
-        let zeros = bits.by_ref().take(32).take_while(|bit| *bit == 0).count();
-        let rest = bits.by_ref().take(zeros);
-        // z zeros, a 1 and z bits b: the value is 2^z + b - 1.
-        rest.fold(1_u64, |number, bit| number << 1 | u64::from(bit)) - 1
-    };
-    is_slice && {
-        number();
-        number() % 5 == 1
+    if !is_slice {
+        return false;
     }
+    let mut bits = unit.iter().skip(1).flat_map(|byte| (0..8).rev().map(move |n| byte >> n & 1));
+    // Where the slice begins, and its type (H.264, 7.3.3).
+    let (_, slice_type) = (exp_golomb(&mut bits), exp_golomb(&mut bits));
+    slice_type % 5 == 1
+}
+
+/// The next number in Exp-Golomb code (H.264, 9.1).
+fn exp_golomb(bits: &mut impl Iterator<Item = u8>) -> u64 {
+    let zeros = bits.by_ref().take(32).take_while(|bit| *bit == 0).count();
+    // z zeros, a 1 and z bits b: the value is 2^z + b - 1.
+    bits.take(zeros).fold(1_u64, |number, bit| number << 1 | u64::from(bit)) - 1
 }
 
 /// Quantisation parameter, on H.264's scale of 0 to 51: that of a good camera. From 30 on faint

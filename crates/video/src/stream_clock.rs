@@ -182,11 +182,13 @@ impl ClockMemory {
 
     /// The offset found last, s, if it is not too old and the host's clock has not been set since.
     fn ahead_s(&self, now: Timestamp, host: &HostClock) -> Option<f64> {
-        let holds = |ahead: &Ahead| {
-            now.seconds_since(ahead.at).abs() <= REMEMBERED_S
-                && ahead.host.set_by_s(host).abs() <= SET_S
-        };
-        self.locked().filter(holds).map(|ahead| ahead.by_s)
+        self.locked().filter(|ahead| ahead.holds(now, host)).map(|ahead| ahead.by_s)
+    }
+}
+
+impl Ahead {
+    fn holds(&self, now: Timestamp, host: &HostClock) -> bool {
+        now.seconds_since(self.at).abs() <= REMEMBERED_S && self.host.set_by_s(host).abs() <= SET_S
     }
 }
 

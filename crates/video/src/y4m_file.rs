@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use crate::{Frame, FrameClock, FrameSource, MAX_PIXELS, Pixels, VideoError};
 
 /// The longest header line that is read, bytes. With half of it the same.
-const MAX_HEADER: u64 = 4096;
+const MOST_HEADER: u64 = 4096;
 
 type Input = Chain<Cursor<Vec<u8>>, Counted>;
 
@@ -48,18 +48,12 @@ impl Y4mSource {
         let damaged = |what: String| VideoError::Damaged { path: path.to_owned(), what };
         let mut file = BufReader::new(File::open(path).map_err(open)?);
         let mut header = Vec::new();
-        file.by_ref().take(MAX_HEADER).read_until(b'\n', &mut header).map_err(open)?;
+        file.by_ref().take(MOST_HEADER).read_until(b'\n', &mut header).map_err(open)?;
         let text = String::from_utf8_lossy(&header).into_owned();
         if !text.starts_with("YUV4MPEG2") {
             return Err(damaged("it does not begin with YUV4MPEG2".to_owned()));
         }
-        // The library takes the last of several values, whatever it is, so exactly one is allowed.
-        let side = |letter: char| {
-            let mut tokens = text.split_whitespace().filter_map(|token| token.strip_prefix(letter));
-            let only = tokens.next().filter(|_| tokens.next().is_none());
-            only.and_then(|digits| digits.parse::<u64>().ok()).unwrap_or(0)
-        };
-        let (width, height) = (side('W'), side('H'));
+        let (width, height) = (side(&text, 'W'), side(&text, 'H'));
         if width == 0 || height == 0 || width.saturating_mul(height) > MAX_PIXELS {
             return Err(damaged(format!("its size is {width}x{height}")));
         }
@@ -89,6 +83,14 @@ impl Y4mSource {
             clock,
         })
     }
+}
+
+/// The picture's width or height by its letter in the header; 0 where that does not tell it.
+fn side(header: &str, letter: char) -> u64 {
+    let mut tokens = header.split_whitespace().filter_map(|token| token.strip_prefix(letter));
+    // The library takes the last of several values, whatever it is, so exactly one is allowed.
+    let only = tokens.next().filter(|_| tokens.next().is_none());
+    only.and_then(|digits| digits.parse().ok()).unwrap_or(0)
 }
 
 impl FrameSource for Y4mSource {

@@ -32,45 +32,59 @@ pub(crate) fn on(extent: &Extent) -> EyeControls3D {
         .with_eye_up([0.0_f32, 0.0, 1.0])
 }
 
+/// A direction to look in, at a target.
+struct Gaze {
+    target: Point3<f64>,
+    towards_eye: Vector3<f64>,
+    /// Axes of the picture.
+    right: Vector3<f64>,
+    up: Vector3<f64>,
+}
+
+impl Gaze {
+    /// The least distance of an eye that has a corner in view: its offset across divided by its
+    /// depth is then at most the field's tangent.
+    fn least_distance(&self, corner: Point3<f64>) -> f64 {
+        let from = corner - self.target;
+        let slope =
+            (from.dot(&self.right).abs() / HALF_WIDTH).max(from.dot(&self.up).abs() / HALF_HEIGHT);
+        from.dot(&self.towards_eye) + slope
+    }
+
+    /// A corner's tangent from the line of sight along an axis.
+    fn seen(&self, corner: Point3<f64>, axis: &Vector3<f64>, distance: f64) -> f64 {
+        let from = corner - self.target;
+        // The depth is kept above a tenth of the distance.
+        from.dot(axis) / (distance - from.dot(&self.towards_eye)).max(0.1 * distance)
+    }
+
+    /// Half-way between the outermost corners along an axis, as seen from a distance: as a length
+    /// at the target.
+    fn middle(&self, extent: &Extent, axis: &Vector3<f64>, distance: f64) -> f64 {
+        let seen = extent.corners().map(|corner| self.seen(corner, axis, distance));
+        let (low, high) = seen.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), seen| {
+            (low.min(seen), high.max(seen))
+        });
+        0.5 * (low + high) * distance
+    }
+}
+
 /// Where the eye is, and the point that it looks at.
 fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
     let towards_eye = Vector3::new(-0.35, -1.0, 0.75).normalize();
     let right = Vector3::z().cross(&towards_eye).normalize();
     let up = towards_eye.cross(&right);
-    let mut target = extent.middle();
+    let mut gaze = Gaze { target: extent.middle(), towards_eye, right, up };
     let mut distance = CLOSEST_M;
     // Near corners look larger, so the centre of the box is not the centre of the picture. The
     // target is moved to the picture's centre and the distance computed again.
     for _ in 0..CENTRINGS {
-        // A corner is in view if its offset across divided by its depth is at most the field's
-        // tangent. The result is the least distance of the eye: offset towards the eye + offset
-        // across / tangent.
-        let needed = |corner: Point3<f64>| {
-            let from = corner - target;
-            let slope =
-                (from.dot(&right).abs() / HALF_WIDTH).max(from.dot(&up).abs() / HALF_HEIGHT);
-            from.dot(&towards_eye) + slope
-        };
-        distance = extent.corners().map(needed).fold(CLOSEST_M, f64::max);
-        // A corner's tangent from the line of sight along an axis; the depth is kept above a tenth
-        // of the distance.
-        let seen = |corner: Point3<f64>, axis: &Vector3<f64>| {
-            let from = corner - target;
-            from.dot(axis) / (distance - from.dot(&towards_eye)).max(0.1 * distance)
-        };
-        let middle = |axis: &Vector3<f64>| {
-            let (low, high) = extent
-                .corners()
-                .map(|corner| seen(corner, axis))
-                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), s| {
-                    (low.min(s), high.max(s))
-                });
-            // Half-way between the outermost corners as seen, as a length at the target's distance.
-            0.5 * (low + high) * distance
-        };
-        target += middle(&right) * right + middle(&up) * up;
+        let distances = extent.corners().map(|corner| gaze.least_distance(corner));
+        distance = distances.fold(CLOSEST_M, f64::max);
+        gaze.target +=
+            gaze.middle(extent, &right, distance) * right + gaze.middle(extent, &up, distance) * up;
     }
-    (target + ROOM * distance * towards_eye, target)
+    (gaze.target + ROOM * distance * towards_eye, gaze.target)
 }
 
 #[cfg(test)]

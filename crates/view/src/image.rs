@@ -108,13 +108,14 @@ impl Ring {
     }
 
     fn strip(&self, scale: f64) -> Vec<[f32; 2]> {
-        let at = |corner: usize| {
-            let (sine, cosine) = (std::f64::consts::TAU * corner as f64 / CORNERS as f64).sin_cos();
-            let [x, y] = self.centre;
-            let place = [x + 0.5 + self.radius * cosine, y + 0.5 + self.radius * sine];
-            place.map(|v| (v * scale) as f32)
-        };
-        (0..=CORNERS).map(at).collect()
+        (0..=CORNERS).map(|corner| self.corner(corner, scale)).collect()
+    }
+
+    fn corner(&self, corner: usize, scale: f64) -> [f32; 2] {
+        let (sine, cosine) = (std::f64::consts::TAU * corner as f64 / CORNERS as f64).sin_cos();
+        let [x, y] = self.centre;
+        let place = [x + 0.5 + self.radius * cosine, y + 0.5 + self.radius * sine];
+        place.map(|v| (v * scale) as f32)
     }
 }
 

@@ -66,12 +66,8 @@ impl Scale {
         let mut deviations: Vec<f64> =
             cells.iter().map(|cell| cell.sd_m).filter(|sd| *sd > 0.0).collect();
         deviations.sort_by(f64::total_cmp);
-        let at = |share: f64| {
-            let index = share * deviations.len().saturating_sub(1) as f64;
-            deviations.get(index.round() as usize).copied()
-        };
-        let best = at(0.05).unwrap_or(1.0);
-        Self { best, worst: at(0.95).unwrap_or(1.0).max(1.01 * best) }
+        let best = quantile(&deviations, 0.05).unwrap_or(1.0);
+        Self { best, worst: quantile(&deviations, 0.95).unwrap_or(1.0).max(1.01 * best) }
     }
 
     fn colour(&self, sd_m: f64) -> [u8; 3] {
@@ -83,6 +79,12 @@ impl Scale {
     fn at(&self, share: f64) -> f64 {
         self.best * (self.worst / self.best).powf(share)
     }
+}
+
+/// The number that a share of sorted numbers lies below; `None` of none.
+fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
+    let index = share * sorted.len().saturating_sub(1) as f64;
+    sorted.get(index.round() as usize).copied()
 }
 
 fn f32s(point: Point3<f64>) -> [f32; 3] {

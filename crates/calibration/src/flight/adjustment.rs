@@ -69,6 +69,12 @@ impl FlightState {
         }
     }
 
+    fn cost_of_rows(&self, model: &AdjustmentModel<'_>) -> f64 {
+        let mut cost = Cost(0.0);
+        self.all(model, &mut cost);
+        cost.0
+    }
+
     fn rate_row(&self, index: usize, start: usize, rate_sd: f64, sink: &mut impl Sink) {
         let rate = self.cameras[index].clock.rate;
         sink.take(&[(vec![(start + CLOCK + 1, rate_sd.recip())], rate / rate_sd)], Tails::Heavy);
@@ -80,26 +86,22 @@ impl FlightState {
         let known = lens::values(&priors.lens);
         let deviations = priors.freedom.prior_sd(&priors.lens);
         for (k, sd) in deviations.into_iter().enumerate() {
-            let term = (start + POSE_AND_CLOCK + k, sd.recip());
-            sink.take(&[(vec![term], (values[k] - known[k]) / sd)], Tails::Normal);
+            hold(start + POSE_AND_CLOCK + k, values[k] - known[k], sd, sink);
         }
     }
 
     /// Prior of a camera's pose and clock before anything is seen.
     fn prior_rows(&self, index: usize, start: usize, priors: &CameraPriors, sink: &mut impl Sink) {
         let camera = &self.cameras[index];
-        let mut hold = |unknown: usize, value: f64, sd: f64| {
-            sink.take(&[(vec![(start + unknown, sd.recip())], value / sd)], Tails::Normal);
-        };
         for axis in 0..3 {
             // A rotation has no zero to be pulled to: only the step is.
-            hold(axis, 0.0, WIDE_ROTATION_RAD);
-            hold(axis + 3, camera.centre[axis], WIDE_M);
+            hold(start + axis, 0.0, WIDE_ROTATION_RAD, sink);
+            hold(start + axis + 3, camera.centre[axis], WIDE_M, sink);
         }
         let clock = &camera.clock;
-        hold(CLOCK, 0.0, WIDE_S);
+        hold(start + CLOCK, 0.0, WIDE_S, sink);
         let readout = READOUT_SHARE * priors.frame_s;
-        hold(CLOCK + 2, clock.readout_s - readout, readout);
+        hold(start + CLOCK + 2, clock.readout_s - readout, readout, sink);
         // The wander's mean and slope belong to the clock's offset and rate: the wander itself is
         // pulled to zero, with a deviation as wide as it may reach over the flight.
         let order = self.order();
@@ -117,6 +119,11 @@ impl FlightState {
             sink.take(&[(terms, (pair[1] - pair[0]) * step)], Tails::Normal);
         }
     }
+}
+
+/// The row of an unknown that is `value` off where its prior has it.
+fn hold(unknown: usize, value: f64, sd: f64, sink: &mut impl Sink) {
+    sink.take(&[(vec![(unknown, sd.recip())], value / sd)], Tails::Normal);
 }
 
 /// Steps at most; from a start within a metre and a tenth of a second, five to eight are enough.
@@ -147,13 +154,8 @@ pub(super) fn adjust(
     let gauge = if flight.log.is_none() { Some(Gauge::of(&start)?) } else { None };
     let model = AdjustmentModel { flight: *flight, priors, gauge: gauge.as_ref() };
     let seen = start.seen_coefficients(flight);
-    let cost_of_rows = |state: &FlightState| {
-        let mut cost = Cost(0.0);
-        state.all(&model, &mut cost);
-        cost.0
-    };
     let (mut state, mut damping) = (start, FIRST_DAMPING);
-    let mut of_rows = cost_of_rows(&state);
+    let mut of_rows = state.cost_of_rows(&model);
     let mut cost = of_rows;
     for _ in 0..MOST_STEPS {
         // The pull of the jerk's prior is computed again for each step: a rough start's is larger
@@ -166,7 +168,7 @@ pub(super) fn adjust(
             state.lean_against(pull, &seen, &mut linear);
             let Solution { step, .. } = linear.solve(damping)?;
             let next = state.moved(step.as_slice());
-            let next_of_rows = cost_of_rows(&next);
+            let next_of_rows = next.cost_of_rows(&model);
             let next_cost = next_of_rows + next.lean(pull, &seen);
             if next_cost < cost {
                 (state, of_rows, cost) = (next, next_of_rows, next_cost);

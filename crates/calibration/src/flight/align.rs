@@ -182,17 +182,25 @@ impl Correspondences {
             }
         }
         for (landmark, place) in survey.placed_landmarks() {
-            let line = |click: &Click| {
-                let index = labels.iter().position(|camera| camera.name == click.camera)?;
-                let direction = lens::direction(&labels[index].intrinsics, click.pixel)?;
-                let camera = &state.cameras[index];
-                Some((camera.centre, camera.rotation * direction.normalize()))
-            };
-            let lines: Vec<_> = landmark.clicks.iter().filter_map(line).collect();
+            let clicks = landmark.clicks.iter();
+            let lines: Vec<_> =
+                clicks.filter_map(|click| sight_line(click, state, labels)).collect();
             known.places.extend(triangulation::place(&lines).map(|(here, _)| (here, place)));
         }
         known
     }
+}
+
+/// The line (a point and a direction) on which a click has its landmark.
+fn sight_line(
+    click: &Click,
+    state: &FlightState,
+    labels: &[CameraLabels],
+) -> Option<(Point3<f64>, Vector3<f64>)> {
+    let index = labels.iter().position(|camera| camera.name == click.camera)?;
+    let direction = lens::direction(&labels[index].intrinsics, click.pixel)?;
+    let camera = &state.cameras[index];
+    Some((camera.centre, camera.rotation * direction.normalize()))
 }
 
 /// A camera's pose by the landmarks in its own picture; `None` where it has too few.
@@ -298,23 +306,23 @@ fn upright(cameras: &[CameraUnknowns]) -> Rotation3<f64> {
 
 /// The same, turned about the vertical to where arms point, and tipped by what remains.
 fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rotation3<f64> {
-    let level = |(here, there): &(Vector3<f64>, Vector3<f64>)| {
-        let here = upright * here;
-        (here.x * there.y - here.y * there.x, here.x * there.x + here.y * there.y)
-    };
     // The heading that maximises the sum of level scalar products: tan = sum of sines / sum of
     // cosines.
-    let (sine, cosine) =
-        arms.iter().map(level).fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1));
+    let level = arms.iter().map(|(here, there)| ((upright * here).xy(), there.xy()));
+    let (sine, cosine) = level.fold((0.0, 0.0), |(sine, cosine), (here, there)| {
+        (sine + here.perp(&there), cosine + here.dot(&there))
+    });
     let turned = Rotation3::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine)) * upright;
-    // The smallest turn that lays one arm on the other.
-    let tip = |(here, there): &(Vector3<f64>, Vector3<f64>)| {
-        let axis = Unit::try_new((turned * here).cross(there), 1e-9)?;
-        Some(Rotation3::from_axis_angle(&axis, (turned * here).angle(there)))
-    };
     // Places on one line: the longest arm determines the tip best.
     let longest = arms.iter().max_by(|a, b| a.0.norm_squared().total_cmp(&b.0.norm_squared()));
-    longest.and_then(tip).map_or(turned, |tip| tip * turned)
+    let tip = longest.and_then(|(here, there)| smallest_turn(&(turned * here), there));
+    tip.map_or(turned, |tip| tip * turned)
+}
+
+/// The smallest turn that lays one arm on another; `None` where they are parallel.
+fn smallest_turn(from: &Vector3<f64>, to: &Vector3<f64>) -> Option<Rotation3<f64>> {
+    let axis = Unit::try_new(from.cross(to), 1e-9)?;
+    Some(Rotation3::from_axis_angle(&axis, from.angle(to)))
 }
 
 impl SimilarityTransform {

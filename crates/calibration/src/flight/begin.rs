@@ -158,11 +158,6 @@ impl BegunFlight {
                 times
             })
             .collect();
-        // Sorted times: the first that is not too early is the only one that has to be looked at.
-        let is_near = |times: &Vec<f64>, time_s: f64| {
-            let next = times.partition_point(|other| *other < time_s - TOGETHER_S);
-            times.get(next).is_some_and(|other| *other < time_s + TOGETHER_S)
-        };
         for (index, camera) in self.cameras.iter_mut().enumerate() {
             let state = &self.states[index];
             camera.labels.retain(|label| {
@@ -208,15 +203,11 @@ impl BegunFlight {
     /// no more fit.
     fn place_the_rest(&mut self, cameras: &[&CameraLabels], sights: &[Sights]) -> Option<()> {
         loop {
-            let of = |camera: &CameraLabels| {
-                let index = cameras.iter().position(|other| other.name == camera.name)?;
-                sights.get(index)
-            };
             let placed: Vec<_> = self
                 .cameras
                 .iter()
                 .zip(&self.states)
-                .filter_map(|(c, s)| Some((of(c)?, s)))
+                .filter_map(|(camera, state)| Some((sights_of(camera, cameras, sights)?, state)))
                 .collect();
             // Each camera that is placed makes the trajectory better, and cameras that did not fit
             // before may fit it.
@@ -237,13 +228,10 @@ impl BegunFlight {
 
     /// Whether it fits about as well as the best start, but with other relative poses.
     fn rivals(&self, best: &Self) -> bool {
-        let turn = |begun: &Self, name: &CameraName| {
-            let index = begun.cameras.iter().position(|camera| camera.name == *name)?;
-            Some(begun.states[index].rotation)
-        };
         let names = best.cameras.iter().map(|camera| &camera.name);
-        let turns: Vec<[Rotation3<f64>; 2]> =
-            names.filter_map(|name| Some([turn(self, name)?, turn(best, name)?])).collect();
+        let turns: Vec<[Rotation3<f64>; 2]> = names
+            .filter_map(|name| Some([self.rotation_of(name)?, best.rotation_of(name)?]))
+            .collect();
         // The two starts have different worlds: only the turn of one camera against the next can be
         // compared.
         let stand_otherwise = turns.windows(2).any(|pair| {
@@ -251,6 +239,11 @@ impl BegunFlight {
             turn_vector(&(own.inverse() * bests)).norm() > OTHERWISE_RAD
         });
         self.fits_as(best) && stand_otherwise
+    }
+
+    fn rotation_of(&self, camera: &CameraName) -> Option<Rotation3<f64>> {
+        let index = self.cameras.iter().position(|own| own.name == *camera)?;
+        Some(self.states[index].rotation)
     }
 
     /// Whether it fits about as well as the best start.
@@ -265,6 +258,22 @@ impl BegunFlight {
         };
         self.cameras.iter().zip(&self.states).map(of_camera).sum()
     }
+}
+
+/// Whether one of these times, which are in order, is about the same.
+fn is_near(times: &[f64], time_s: f64) -> bool {
+    // The first that is not too early is the only one that has to be looked at.
+    let next = times.partition_point(|other| *other < time_s - TOGETHER_S);
+    times.get(next).is_some_and(|other| *other < time_s + TOGETHER_S)
+}
+
+/// What a camera, one of these, saw of the target.
+fn sights_of<'a>(
+    camera: &CameraLabels,
+    cameras: &[&CameraLabels],
+    sights: &'a [Sights],
+) -> Option<&'a Sights> {
+    sights.get(cameras.iter().position(|other| other.name == camera.name)?)
 }
 
 /// Whether a camera has enough labels, and of one flight.

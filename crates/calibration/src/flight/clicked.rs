@@ -87,19 +87,21 @@ impl FlightState {
     /// The misfit of each click.
     pub(super) fn landmark_misfits(&self, flight: &Flight<'_>) -> Vec<LandmarkMisfit> {
         let misfits = flight.survey.landmarks.iter().flat_map(|landmark| {
-            let misfit =
-                |(_, click, seen): (usize, &Click, Option<ClickResidual>)| LandmarkMisfit {
-                    landmark: landmark.name.clone(),
-                    camera: click.camera.clone(),
-                    residual_px: seen.as_ref().map(|seen| -seen.residual),
-                    deviations: seen
-                        .as_ref()
-                        .and_then(|seen| deviations(seen, click))
-                        .unwrap_or(UNSEEN),
-                };
-            self.clicks(flight, landmark).into_iter().map(misfit).collect::<Vec<_>>()
+            let clicks = self.clicks(flight, landmark).into_iter();
+            clicks.map(|(_, click, seen)| LandmarkMisfit::of(landmark, click, seen.as_ref()))
         });
         misfits.collect()
+    }
+}
+
+impl LandmarkMisfit {
+    fn of(landmark: &SurveyedLandmark, click: &Click, seen: Option<&ClickResidual>) -> Self {
+        Self {
+            landmark: landmark.name.clone(),
+            camera: click.camera.clone(),
+            residual_px: seen.map(|seen| -seen.residual),
+            deviations: seen.and_then(|seen| deviations(seen, click)).unwrap_or(UNSEEN),
+        }
     }
 }
 

@@ -78,6 +78,11 @@ impl Course {
         is_known.then(|| self.way.weights(time_s))?
     }
 
+    /// The target's place at a time; `None` where the trajectory is not known.
+    pub(super) fn place_at(&self, time_s: f64) -> Option<Point3<f64>> {
+        self.weights(time_s).map(|weights| self.way.place(&weights))
+    }
+
     /// A course that is known at no time.
     pub(super) fn nowhere() -> Self {
         let errors = LogErrors { sd_m: 1.0, drift_sd_m: 0.0, drift_time_s: 1.0 };
@@ -93,7 +98,7 @@ impl Course {
     /// The place at any time: as it is where it is known, straight from one known place to the
     /// next, and constant before the begin and after the end.
     fn place_throughout(&self, time_s: f64) -> Option<Vector3<f64>> {
-        let known = |time_s: f64| Some(self.way.place(&self.way.weights(time_s)?).coords);
+        let known = |time_s: f64| Some(self.way.place_at(time_s)?.coords);
         if self.weights(time_s).is_some() {
             return known(time_s);
         }
@@ -122,9 +127,8 @@ impl Course {
 
     /// The median distance of the target from a place, m.
     pub(super) fn middle_distance(&self, place: Point3<f64>) -> f64 {
-        let known = self.times_s.iter().filter_map(|time_s| self.way.weights(*time_s));
-        let mut distances: Vec<f64> =
-            known.map(|weights| (self.way.place(&weights) - place).norm()).collect();
+        let known = self.times_s.iter().filter_map(|time_s| self.way.place_at(*time_s));
+        let mut distances: Vec<f64> = known.map(|known| (known - place).norm()).collect();
         distances.sort_unstable_by(f64::total_cmp);
         distances.get(distances.len() / 2).map_or(1.0, |distance| distance.max(1.0))
     }

@@ -22,14 +22,30 @@ const STRIDE: usize = 20;
 const MOST_STATED: f64 = 10.0;
 
 /// For each camera the distance between its two halves' results in the image, divided by the
-/// distance that both state; `None` where one half saw too little.
-pub(super) fn ratios(
-    flight: &Flight<'_>,
-    priors: &Priors,
-    adjusted: &AdjustedFlight,
-) -> Vec<Option<f64>> {
-    let count = flight.cameras.len();
-    compared(flight, priors, &adjusted.state).unwrap_or_else(|| vec![None; count])
+/// distance that both state.
+pub(super) struct HalvesRatios {
+    /// `None` where one half saw too little.
+    pub(super) of_cameras: Vec<Option<f64>>,
+    /// Mean of those that are known; zero for none.
+    mean: f64,
+}
+
+impl HalvesRatios {
+    pub(super) fn of(flight: &Flight<'_>, priors: &Priors, adjusted: &AdjustedFlight) -> Self {
+        let count = flight.cameras.len();
+        let of_cameras =
+            compared(flight, priors, &adjusted.state).unwrap_or_else(|| vec![None; count]);
+        let known: Vec<f64> = of_cameras.iter().copied().flatten().collect();
+        let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
+        Self { of_cameras, mean }
+    }
+
+    /// Factor by which a camera's covariance is to be enlarged.
+    pub(super) fn variance_factor(&self, index: usize) -> f64 {
+        // A camera of which one half saw too little is taken to be as far off as the others on
+        // average.
+        self.of_cameras[index].unwrap_or(self.mean).max(1.0).powi(2)
+    }
 }
 
 fn compared(flight: &Flight<'_>, priors: &Priors, state: &FlightState) -> Option<Vec<Option<f64>>> {
@@ -70,12 +86,19 @@ fn half(
     middle_s: f64,
     is_late: bool,
 ) -> Vec<CameraLabels> {
-    let of_camera = |(camera, state): (&CameraLabels, &CameraUnknowns)| {
-        let is_in = |label: &&Label| (state.time_s(label) >= middle_s) == is_late;
-        let labels = camera.labels.iter().filter(is_in).copied().collect();
-        CameraLabels { labels, ..camera.clone() }
-    };
-    flight.cameras.iter().zip(&state.cameras).map(of_camera).collect()
+    let cameras = flight.cameras.iter().zip(&state.cameras);
+    cameras.map(|(camera, state)| half_of(camera, state, middle_s, is_late)).collect()
+}
+
+fn half_of(
+    camera: &CameraLabels,
+    state: &CameraUnknowns,
+    middle_s: f64,
+    is_late: bool,
+) -> CameraLabels {
+    let is_in = |label: &&Label| (state.time_s(label) >= middle_s) == is_late;
+    let labels = camera.labels.iter().filter(is_in).copied().collect();
+    CameraLabels { labels, ..camera.clone() }
 }
 
 /// Difference between the halves of the cameras' own unknowns, without the datum, and the
@@ -130,8 +153,7 @@ impl DifferenceOfHalves {
         let covariance = self.covariance.view((start, start), (own, own));
         let (mut found, mut stated, mut count) = (0.0, 0.0, 0.0);
         for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
-            let weights = state.way.weights(camera.time_s(label));
-            let place = weights.map(|weights| state.way.place(&weights));
+            let place = state.way.place_at(camera.time_s(label));
             let Some(by_own) = place.and_then(|place| in_image(camera, label, place)) else {
                 continue;
             };

@@ -5,6 +5,7 @@ use nalgebra::{DMatrix, DVector, Rotation3};
 
 use super::model::{CameraLabels, POSE_AND_CLOCK};
 use super::noise::Tails;
+use super::normal::Derivative;
 use super::rows::{ResidualRow, Sink};
 use super::state::{Flight, FlightState};
 use crate::calibrated_camera::CalibratedCamera;
@@ -38,7 +39,6 @@ impl FlightState {
     ) {
         let Some(known) = flight.known(index) else { return };
         let camera = &self.cameras[index];
-        let count = lens::numbers(&camera.intrinsics);
         let lens = lens_step(known, camera);
         let pose = pose_step(known, camera);
         let by_lens = &known.lens.pose_by_lens;
@@ -47,23 +47,26 @@ impl FlightState {
             // L^-1 (pose - B lens), B the pose's regression on the lens: what the lens does not
             // explain of the pose.
             let beside = &whitened * (&pose - by_lens * &lens);
-            let follows = &whitened * by_lens;
-            let row = |axis: usize| -> ResidualRow {
-                let of_pose = (0..6).map(|k| (start + k, whitened[(axis, k)]));
-                let of_lens = (0..count).map(|k| (start + POSE_AND_CLOCK + k, -follows[(axis, k)]));
-                (of_pose.chain(of_lens).collect(), beside[axis])
-            };
-            sink.take(&(0..6).map(row).collect::<Vec<_>>(), Tails::Known);
+            let follows = -(&whitened * by_lens);
+            let rows = (0..6).map(|axis| {
+                let of_lens = terms(start + POSE_AND_CLOCK, &follows, axis);
+                (terms(start, &whitened, axis).chain(of_lens).collect(), beside[axis])
+            });
+            sink.take(&rows.collect::<Vec<ResidualRow>>(), Tails::Known);
         }
         if let Some(whitened) = whitening(&known.lens.covariance) {
             let beside = &whitened * &lens;
-            let row = |axis: usize| -> ResidualRow {
-                let terms = (0..count).map(|k| (start + POSE_AND_CLOCK + k, whitened[(axis, k)]));
-                (terms.collect(), beside[axis])
-            };
-            sink.take(&(0..count).map(row).collect::<Vec<_>>(), Tails::Known);
+            let rows = (0..beside.len()).map(|axis| {
+                (terms(start + POSE_AND_CLOCK, &whitened, axis).collect(), beside[axis])
+            });
+            sink.take(&rows.collect::<Vec<ResidualRow>>(), Tails::Known);
         }
     }
+}
+
+/// A row of a matrix as derivatives by successive unknowns, from the one at `start` on.
+fn terms(start: usize, matrix: &DMatrix<f64>, row: usize) -> impl Iterator<Item = Derivative> {
+    (0..matrix.ncols()).map(move |k| (start + k, matrix[(row, k)]))
 }
 
 /// Step from the known pose to the state's: a turn about the camera's axes (rad), and its centre

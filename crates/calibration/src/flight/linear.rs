@@ -126,11 +126,9 @@ impl Normalised {
         let count = pairs.len() as f64;
         let middle =
             Point3::from(pairs.iter().map(|(_, p)| p.coords).sum::<Vector3<f64>>() / count);
-        let spread = |sum: Matrix3<f64>, (_, p): &(_, Point3<f64>)| {
-            let offset = p - middle;
-            sum + offset * offset.transpose()
-        };
-        let spread = pairs.iter().fold(Matrix3::zeros(), spread) / count;
+        let offsets = pairs.iter().map(|(_, place)| place - middle);
+        let squares: Matrix3<f64> = offsets.map(|offset| offset * offset.transpose()).sum();
+        let spread = squares / count;
         // Principal axes, the widest spread first, made right-handed.
         let eigen = spread.symmetric_eigen();
         let mut order = [0, 1, 2];

@@ -32,11 +32,14 @@ struct OneSecondMean {
 
 fn blocks(labels: &[FittedLabel]) -> Vec<OneSecondMean> {
     let number = |label: &FittedLabel| (label.own_time_s / BLOCK_S).floor();
-    let block = |chunk: &[FittedLabel]| OneSecondMean {
-        time_s: chunk[0].own_time_s,
-        mean: chunk.iter().map(|label| label.beside_px).sum::<Vector2<f64>>() / chunk.len() as f64,
-    };
-    labels.chunk_by(|a, b| number(a) == number(b)).map(block).collect()
+    labels.chunk_by(|a, b| number(a) == number(b)).map(OneSecondMean::of).collect()
+}
+
+impl OneSecondMean {
+    fn of(labels: &[FittedLabel]) -> Self {
+        let sum: Vector2<f64> = labels.iter().map(|label| label.beside_px).sum();
+        Self { time_s: labels[0].own_time_s, mean: sum / labels.len() as f64 }
+    }
 }
 
 /// The medians of some blocks' means, axis by axis, and the sum of the absolute deviations from

@@ -50,14 +50,15 @@ impl Tails {
         if self.is_normal(squares, count) {
             return squares;
         }
+        let Some(freedom) = self.freedom() else { return squares };
         let count = count as f64;
-        let heavy = |freedom: f64| (freedom + count) * (squares / freedom).ln_1p();
+        let heavy = (freedom + count) * (squares / freedom).ln_1p();
         // The constant that makes both parts equal where they join, at squares = count.
-        let joined = |freedom: f64| match self {
+        let joined = match self {
             Self::Known => count - (freedom + count) * (count / freedom).ln_1p(),
             _ => 0.0,
         };
-        self.freedom().map_or(squares, |freedom| heavy(freedom) + joined(freedom))
+        heavy + joined
     }
 }
 
@@ -120,32 +121,32 @@ impl LabelNoise {
         // Var(e2 - e1) / 2 = variance - covariance of neighbours.
         let of_steps = typical(steps.map(|pair| pair[1].1 - pair[0].1)) / 2.0;
         let of_means = typical(block_means(residuals).into_iter()) + explained;
-        // Lasting variance for a correlation time, by the covariance of successive residuals:
-        // variance - of_steps = lasting x exp(-frame / T).
-        let lasting = |lasting_s: f64| {
-            let kept = (-frame_s / lasting_s).exp();
-            ((variance - of_steps).max(0.0) / kept).min(variance)
-        };
-        // Variance of blocks' means: the lasting part by its share, the white part by the number of
-        // labels.
-        let means = |lasting_s: f64| {
-            let lasting = lasting(lasting_s);
-            lasting * share_of_means(lasting_s) + (variance - lasting) * frame_s / BLOCK_S
-        };
+        let lasting_at = |lasting_s| lasting_variance(variance, of_steps, frame_s, lasting_s);
         // Bisection for the correlation time with which blocks' means vary as they do.
         let (mut least, mut most) = (frame_s, LONGEST_S.max(2.0 * frame_s));
         for _ in 0..40 {
             let middle = f64::midpoint(least, most);
+            let lasting = lasting_at(middle);
+            // Variance of blocks' means: the lasting part by its share, the white part by the
+            // number of labels.
+            let means = lasting * share_of_means(middle) + (variance - lasting) * frame_s / BLOCK_S;
             // A longer correlation leaves more of the variance in the means.
-            if means(middle) < of_means { least = middle } else { most = middle }
+            if means < of_means { least = middle } else { most = middle }
         }
-        let lasting = lasting(least);
+        let lasting = lasting_at(least);
         Self {
             white_px: (variance - lasting).max(0.0).sqrt().max(LEAST_WHITE_PX),
             lasting_px: lasting.sqrt(),
             lasting_s: least,
         }
     }
+}
+
+/// The part of the variance that lasts, for a correlation time, by the covariance of successive
+/// residuals: `variance - of_steps = lasting x exp(-frame / T)`.
+fn lasting_variance(variance: f64, of_steps: f64, frame_s: f64, lasting_s: f64) -> f64 {
+    let kept = (-frame_s / lasting_s).exp();
+    ((variance - of_steps).max(0.0) / kept).min(variance)
 }
 
 /// Least white noise of labels, pixels: they are not drawn more finely. With half of it bearings of

@@ -143,13 +143,15 @@ fn essential(seen: &[[Vector3<f64>; 2]]) -> (Matrix3<f64>, f64) {
 
 /// The median angle by which an essential matrix misses, rad.
 fn misfit(matrix: &Matrix3<f64>, seen: &[[Vector3<f64>; 2]]) -> f64 {
-    let angle = |[a, b]: &[Vector3<f64>; 2]| {
-        // Angle from the epipolar plane: |b' E a| over the root mean square length of E a and E' b.
-        let (of_a, of_b) = (matrix * a, matrix.tr_mul(b));
-        let size2 = f64::midpoint(of_a.norm_squared(), of_b.norm_squared());
-        b.dot(&of_a).abs() / size2.sqrt().max(1e-12)
-    };
-    median(seen.iter().map(angle))
+    median(seen.iter().map(|both| from_epipolar_plane(matrix, both)))
+}
+
+/// Angle of a direction from the epipolar plane, rad: `|b' E a|` over the root mean square length
+/// of `E a` and `E' b`.
+fn from_epipolar_plane(matrix: &Matrix3<f64>, [a, b]: &[Vector3<f64>; 2]) -> f64 {
+    let (of_a, of_b) = (matrix * a, matrix.tr_mul(b));
+    let size2 = f64::midpoint(of_a.norm_squared(), of_b.norm_squared());
+    b.dot(&of_a).abs() / size2.sqrt().max(1e-12)
 }
 
 fn median(values: impl Iterator<Item = f64>) -> f64 {
@@ -198,10 +200,8 @@ fn offset(
     let share = LEAST_SHARE * fewer as f64 / first.times_s.len() as f64;
     let tried = first.times(TRIED).count();
     let enough = LEAST_COMMON.max((share * tried as f64) as usize);
-    let misfit = |ahead_s: f64| {
-        let seen = common(first, second, ahead_s);
-        if seen.len() < enough { f64::INFINITY } else { misfit_of(&seen) }
-    };
+    let seen = |ahead_s| Some(common(first, second, ahead_s)).filter(|seen| seen.len() >= enough);
+    let misfit = |ahead_s| seen(ahead_s).map_or(f64::INFINITY, |seen| misfit_of(&seen));
     let (least, most) = (from - other_to, to - other_from);
     let steps = ((most - least) / STEP_S) as usize;
     let offsets_s = (0..=steps).map(|k| least + k as f64 * STEP_S);

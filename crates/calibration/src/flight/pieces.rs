@@ -36,6 +36,12 @@ impl Piece {
         let share = x.hypot(y) / (step_px * frames);
         ((1.0..=FRAMES).contains(&frames) && share <= 1.0).then_some(share)
     }
+
+    /// Whether no label from this time on can continue it.
+    fn is_over(&self, labels: &[Label], time_s: f64, frame_s: f64) -> bool {
+        let last_s = self.labels.last().map_or(f64::NEG_INFINITY, |last| labels[*last].time_s);
+        time_s - last_s > (FRAMES + 0.5) * frame_s
+    }
 }
 
 /// The labels of the longest pieces, in the order of their times.
@@ -111,27 +117,28 @@ pub(super) fn chains(pieces: &[Vec<Label>], width_px: f64) -> Vec<Vec<usize>> {
 fn astray(piece: &[Label], next: &[Label], width_px: f64) -> Option<f64> {
     let (end, start) = (piece.last()?, next.first()?);
     let gap_s = start.time_s - end.time_s;
-    let place = |label: &Label| Vector2::new(label.pixel.x(), label.pixel.y());
-    let pace = |labels: &[Label]| {
-        let (from, to) = (labels.first()?, labels.last()?);
-        Some((place(to) - place(from)) / (to.time_s - from.time_s))
-    };
     let from = pace(&piece[piece.len().saturating_sub(PACE)..])?;
     let to = pace(&next[..PACE.min(next.len())])?;
     // Predicted with the speed before for half of the gap and the speed after for the other half.
-    let expected = place(end) + (from + to) * (gap_s / 2.0);
-    let beside = (place(start) - expected).norm() / (width_px * ASTRAY * (1.0 + gap_s));
+    let expected = in_image(end) + (from + to) * (gap_s / 2.0);
+    let beside = (in_image(start) - expected).norm() / (width_px * ASTRAY * (1.0 + gap_s));
     ((0.0..LOST_S).contains(&gap_s) && beside < 1.0).then_some(beside)
+}
+
+fn in_image(label: &Label) -> Vector2<f64> {
+    Vector2::new(label.pixel.x(), label.pixel.y())
+}
+
+/// Speed in the image from the first of some labels to the last, pixels per second.
+fn pace(labels: &[Label]) -> Option<Vector2<f64>> {
+    let (from, to) = (labels.first()?, labels.last()?);
+    Some((in_image(to) - in_image(from)) / (to.time_s - from.time_s))
 }
 
 fn cut(labels: &[Label], step_px: f64, frame_s: f64) -> Vec<Piece> {
     let (mut open, mut ended): (Vec<Piece>, Vec<Piece>) = (Vec::new(), Vec::new());
     for (index, label) in labels.iter().enumerate() {
-        let is_over = |piece: &mut Piece| {
-            let last = piece.labels.last().map_or(f64::NEG_INFINITY, |last| labels[*last].time_s);
-            label.time_s - last > (FRAMES + 0.5) * frame_s
-        };
-        ended.extend(open.extract_if(.., is_over));
+        ended.extend(open.extract_if(.., |piece| piece.is_over(labels, label.time_s, frame_s)));
         let nearest = open
             .iter_mut()
             .filter_map(|piece| Some((piece.away(labels, label, step_px, frame_s)?, piece)))

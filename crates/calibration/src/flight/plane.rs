@@ -64,11 +64,14 @@ pub(super) fn poses(
         let shift = (unit - turn) * normal;
         [(turn, shift, normal), (turn, -shift, -normal)]
     });
-    let is_ahead = |(_, _, normal): &(Matrix3<f64>, Vector3<f64>, Vector3<f64>)| {
-        let ahead = seen.iter().filter(|[a, _]| normal.dot(a) > 0.0).count();
-        10 * ahead > 9 * seen.len()
-    };
-    found.filter(is_ahead).map(|(turn, shift, _)| (turn, shift)).collect()
+    let ahead = found.filter(|(_, _, normal)| is_ahead(normal, seen));
+    ahead.map(|(turn, shift, _)| (turn, shift)).collect()
+}
+
+/// Whether nearly all places lie ahead of the first camera, if this is the normal of their plane.
+fn is_ahead(normal: &Vector3<f64>, seen: &[[Vector3<f64>; 2]]) -> bool {
+    let ahead = seen.iter().filter(|[a, _]| normal.dot(a) > 0.0).count();
+    10 * ahead > 9 * seen.len()
 }
 
 #[cfg(test)]

@@ -10,10 +10,10 @@ use super::datum::Followers;
 use super::error::Refusal;
 use super::fitted::{self, FittedLabel, FittedSample};
 use super::gauge::Gauge;
-use super::halves;
-use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
+use super::halves::HalvesRatios;
+use super::model::{CLOCK, FlightLog, POSE_AND_CLOCK};
 use super::moved::{self, MovedAt};
-use super::state::{Flight, FlightState, Priors, square};
+use super::state::{CameraPriors, Flight, FlightState, Priors, square};
 use crate::calibrated_camera::{CalibratedCamera, ClockCorrection};
 use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
@@ -126,7 +126,7 @@ pub(super) fn results(
     mut adjusted: AdjustedFlight,
     priors: &Priors,
 ) -> Option<FlightResult> {
-    let ratios = halves::ratios(flight, priors, &adjusted);
+    let ratios = HalvesRatios::of(flight, priors, &adjusted);
     let followers = Followers::of(&adjusted.state);
     let shown = followers.estimator(adjusted.covariance.information())?;
     // What no measurement said of the site as a whole: the linearised jerk, and without a log the
@@ -142,44 +142,10 @@ pub(super) fn results(
         // P - H D H': what a camera is off by beside the site as a whole.
         adjusted.covariance.take_off(shown.of_cameras());
     }
-    let known: Vec<f64> = ratios.iter().copied().flatten().collect();
-    let typical = known.iter().sum::<f64>() / known.len().max(1) as f64;
     let state = &adjusted.state;
-    let starts = state.starts();
-    let mut cameras = Vec::new();
-    for (index, camera) in state.cameras.iter().enumerate() {
-        let start = starts[index] - state.order().chain();
-        let at = CameraBlock { covariance: adjusted.covariance.others(), start };
-        let prior = &priors.cameras[index];
-        let fitted = fitted::labels(flight, state, index);
-        let within = |label: &&FittedLabel| label.beside_px.norm() < 4.0 * prior.noise.sd_px();
-        let used = fitted.iter().filter(within);
-        let squares: Vec<f64> = used.map(|label| square(label.beside_px)).collect();
-        // Cameras of which one half saw too little are taken to be as far off as the others on
-        // average.
-        let ratio = ratios[index].unwrap_or(typical).max(1.0).powi(2);
-        let pose = Pose::new(*camera.rotation.matrix(), camera.centre).ok()?;
-        cameras.push(CameraResult {
-            name: flight.cameras[index].name.clone(),
-            camera: Camera::new(camera.intrinsics, pose).ok()?,
-            pose_covariance: at.pose_with_lens_held(lens::numbers(&camera.intrinsics))? * ratio,
-            // A factor on both covariances: the regression of pose on lens stays.
-            lens: at.lens(lens::numbers(&camera.intrinsics), ratio)?,
-            clock: clock_result(flight, &adjusted, index, prior.wander),
-            noise: prior.noise,
-            frame_s: prior.frame_s,
-            range_m: middle_range(flight, state, index),
-            labels: flight.cameras[index].labels.len(),
-            used: squares.len(),
-            residual_px: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
-            halves_ratio: ratios[index],
-            moved: moved::likeliest(&fitted),
-            fitted,
-            focal_ratio: camera.intrinsics.fx / prior.lens.fx,
-            // The first lens number is ln fx: its deviation is that of the ratio.
-            focal_ratio_sd: at.covariance_of(POSE_AND_CLOCK, POSE_AND_CLOCK).sqrt(),
-        });
-    }
+    let cameras = (0..state.cameras.len())
+        .map(|index| camera_result(flight, &adjusted, &priors.cameras[index], &ratios, index))
+        .collect::<Option<_>>()?;
     let samples = flight.log.map_or_else(Vec::new, |log| fitted::samples(log, state));
     Some(FlightResult {
         cameras,
@@ -192,14 +158,52 @@ pub(super) fn results(
     })
 }
 
+/// `None` if what was found is no camera, or its covariance is none.
+fn camera_result(
+    flight: &Flight<'_>,
+    adjusted: &AdjustedFlight,
+    prior: &CameraPriors,
+    ratios: &HalvesRatios,
+    index: usize,
+) -> Option<CameraResult> {
+    let state = &adjusted.state;
+    let camera = &state.cameras[index];
+    let start = state.starts()[index] - state.order().chain();
+    let at = CameraBlock { covariance: adjusted.covariance.others(), start };
+    let fitted = fitted::labels(flight, state, index);
+    let within = |label: &&FittedLabel| label.beside_px.norm() < 4.0 * prior.noise.sd_px();
+    let used = fitted.iter().filter(within);
+    let squares: Vec<f64> = used.map(|label| square(label.beside_px)).collect();
+    let factor = ratios.variance_factor(index);
+    let pose = Pose::new(*camera.rotation.matrix(), camera.centre).ok()?;
+    Some(CameraResult {
+        name: flight.cameras[index].name.clone(),
+        camera: Camera::new(camera.intrinsics, pose).ok()?,
+        pose_covariance: at.pose_with_lens_held(lens::numbers(&camera.intrinsics))? * factor,
+        // A factor on both covariances: the regression of pose on lens stays.
+        lens: at.lens(lens::numbers(&camera.intrinsics), factor)?,
+        clock: clock_result(flight, adjusted, index, prior.wander),
+        noise: prior.noise,
+        frame_s: prior.frame_s,
+        range_m: middle_range(flight, state, index),
+        labels: flight.cameras[index].labels.len(),
+        used: squares.len(),
+        residual_px: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
+        halves_ratio: ratios.of_cameras[index],
+        moved: moved::likeliest(&fitted),
+        fitted,
+        focal_ratio: camera.intrinsics.fx / prior.lens.fx,
+        // The first lens number is ln fx: its deviation is that of the ratio.
+        focal_ratio_sd: at.covariance_of(POSE_AND_CLOCK, POSE_AND_CLOCK).sqrt(),
+    })
+}
+
 /// The median range at which a camera saw the target, m.
 fn middle_range(flight: &Flight<'_>, state: &FlightState, index: usize) -> f64 {
     let camera = &state.cameras[index];
-    let range = |label: &Label| {
-        let weights = state.way.weights(camera.time_s(label))?;
-        Some((state.way.place(&weights) - camera.centre).norm())
-    };
-    let mut ranges: Vec<f64> = flight.cameras[index].labels.iter().filter_map(range).collect();
+    let labels = flight.cameras[index].labels.iter();
+    let places = labels.filter_map(|label| state.way.place_at(camera.time_s(label)));
+    let mut ranges: Vec<f64> = places.map(|place| (place - camera.centre).norm()).collect();
     ranges.sort_unstable_by(f64::total_cmp);
     ranges.get(ranges.len() / 2).copied().unwrap_or(1.0)
 }

@@ -83,6 +83,11 @@ impl TrajectorySpline {
         Point3::from(self.sum(weights.first, &weights.place))
     }
 
+    /// The place at a time; `None` outside of its range.
+    pub(super) fn place_at(&self, time_s: f64) -> Option<Point3<f64>> {
+        self.weights(time_s).map(|weights| self.place(&weights))
+    }
+
     /// The velocity, m/s.
     pub(super) fn velocity(&self, weights: &Weights) -> Vector3<f64> {
         self.sum(weights.first, &weights.velocity)

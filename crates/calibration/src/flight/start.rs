@@ -1,6 +1,7 @@
 //! Start with a log: a camera's pose and clock from nothing but its labels and the target's log.
 
-use nalgebra::{DMatrix, Matrix3, Point3, Rotation3, SMatrix, Vector3};
+use crossfix_geometry::tangent_basis;
+use nalgebra::{DMatrix, DVector, Matrix3, Point3, Rotation3, SMatrix, Unit, Vector2, Vector3};
 
 use super::course::Course;
 use super::linear::{self, AffineMap, DirectionToPlace};
@@ -50,6 +51,19 @@ struct Ray {
     direction: Vector3<f64>,
 }
 
+impl Ray {
+    fn of(camera: &CameraLabels, label: &Label) -> Option<Self> {
+        let direction = lens::direction(&camera.intrinsics, label.pixel)?;
+        let height = f64::from(camera.intrinsics.size.height);
+        Some(Self { time_s: label.time_s, row_share: label.pixel.y() / height - 0.5, direction })
+    }
+
+    /// The ray with the target's place at a common time; `None` where that is not known.
+    fn met_at(&self, time_s: f64, course: &Course) -> Option<DirectionToPlace> {
+        Some((self.direction, course.place_at(time_s)?))
+    }
+}
+
 /// A camera's state that fits the log's trajectory, and its median misfit (rad); `None`: no offset
 /// puts enough of its labels within the log.
 pub(super) fn find(
@@ -60,12 +74,13 @@ pub(super) fn find(
     let all = rays(camera, &camera.labels);
     let by_all = best_of(&all, &all, course, frame_s);
     let is_clear = by_all.as_ref().is_some_and(|found| found.misfit < CLEAR_RAD);
-    let by_pieces = || {
+    let by_pieces = if is_clear {
+        None
+    } else {
         // Birds bend a linear solution, but not the robust refinement.
         let pieces = rays(camera, &pieces::longest(camera, frame_s));
         best_of(&pieces, &all, course, frame_s)
     };
-    let by_pieces = if is_clear { None } else { by_pieces() };
     let both = by_all.into_iter().chain(by_pieces);
     let best = both.min_by(|a, b| a.misfit.total_cmp(&b.misfit))?;
     let state = state(camera, course, (best.rotation, best.centre, best.offset_s));
@@ -195,10 +210,7 @@ pub(super) fn state(
 
 /// The median angle between a camera's labels and a course, rad.
 pub(super) fn misfit_of(camera: &CameraLabels, state: &CameraUnknowns, course: &Course) -> f64 {
-    let at = |ray: &Ray| {
-        let weights = course.weights(state.clock.common_s(ray.time_s))?;
-        Some((ray.direction, course.way.place(&weights)))
-    };
+    let at = |ray: &Ray| ray.met_at(state.clock.common_s(ray.time_s), course);
     let rays = rays(camera, &camera.labels);
     let pairs: Vec<DirectionToPlace> = rays.iter().filter_map(at).collect();
     linear::median(angles(&pairs, &state.rotation, state.centre))
@@ -207,12 +219,7 @@ pub(super) fn misfit_of(camera: &CameraLabels, state: &CameraUnknowns, course: &
 /// Rays of a camera's labels, at most [`TRIED`], evenly spread.
 fn rays(camera: &CameraLabels, labels: &[Label]) -> Vec<Ray> {
     let stride = labels.len().div_ceil(TRIED).max(1);
-    let height = f64::from(camera.intrinsics.size.height);
-    let ray = |label: &Label| {
-        let direction = lens::direction(&camera.intrinsics, label.pixel)?;
-        Some(Ray { time_s: label.time_s, row_share: label.pixel.y() / height - 0.5, direction })
-    };
-    labels.iter().step_by(stride).filter_map(ray).collect()
+    labels.iter().step_by(stride).filter_map(|label| Ray::of(camera, label)).collect()
 }
 
 /// The linear solutions at a clock offset.
@@ -243,10 +250,7 @@ fn cleaned(rays: &[Ray], course: &Course, offset_s: f64) -> Option<CandidateStar
 
 /// Directions with the target's places at a clock offset, if there are enough.
 fn seen_at(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Vec<DirectionToPlace>> {
-    let at = |ray: &Ray| {
-        let weights = course.weights(ray.time_s + offset_s)?;
-        Some((ray.direction, course.way.place(&weights)))
-    };
+    let at = |ray: &Ray| ray.met_at(ray.time_s + offset_s, course);
     let pairs: Vec<DirectionToPlace> = rays.iter().filter_map(at).collect();
     // Otherwise an offset that leaves a few rays within the log would always fit best.
     let enough = LEAST_TRIED.max((LEAST_SHARE * rays.len() as f64) as usize);
@@ -268,12 +272,33 @@ impl CandidateStart {
         course: &Course,
         near_rad: f64,
     ) -> bool {
-        let at = |ray: &Ray| {
-            let weights = course.weights(ray.time_s + self.offset_s)?;
-            Some((ray.direction, course.way.place(&weights)))
-        };
+        let at = |ray: &Ray| ray.met_at(ray.time_s + self.offset_s, course);
         let seen: Vec<DirectionToPlace> = rays(camera, piece).iter().filter_map(at).collect();
         seen.is_empty() || linear::median(angles(&seen, &self.rotation, self.centre)) < near_rad
+    }
+
+    /// Where the target's place is seen in the tangent plane of the observed direction, and the
+    /// derivatives of that by a rotation about the camera's axes, by its centre and by the offset.
+    fn residual(
+        &self,
+        observed: &Vector3<f64>,
+        place: Point3<f64>,
+        velocity: Vector3<f64>,
+    ) -> (Vector2<f64>, SMatrix<f64, 2, 7>) {
+        let to_place = self.rotation.inverse_transform_vector(&(place - self.centre));
+        let range = to_place.norm();
+        let tangents = tangent_basis(&Unit::new_normalize(*observed));
+        let seen_at = to_place / range;
+        // d(to_place / range) / d(to_place) = (I - s s') / range
+        let by_point =
+            tangents.transpose() * (Matrix3::identity() - seen_at * seen_at.transpose()) / range;
+        let by_place = by_point * self.rotation.matrix().transpose();
+        let mut by = SMatrix::<f64, 2, 7>::zeros();
+        by.fixed_columns_mut::<3>(0).copy_from(&(by_point * to_place.cross_matrix()));
+        by.fixed_columns_mut::<3>(3).copy_from(&-by_place);
+        // d(residual) / d(offset) = d(residual) / d(place) v.
+        by.set_column(6, &(by_place * velocity));
+        (tangents.transpose() * seen_at, by)
     }
 }
 
@@ -304,7 +329,7 @@ fn refined(
         // The weights sharpen as the fit improves: what is far off by then pulls less and less.
         let scale = now.misfit.max(1e-4);
         let mut normal = DMatrix::<f64>::zeros(7, 7);
-        let mut right = nalgebra::DVector::<f64>::zeros(7);
+        let mut right = DVector::<f64>::zeros(7);
         let mut seen = Vec::new();
         for ray in rays {
             // The read-out time is taken to be half of the frame time.
@@ -312,27 +337,9 @@ fn refined(
             let Some(weights) = course.weights(time_s) else { continue };
             let (place, velocity) = (course.way.place(&weights), course.way.velocity(&weights));
             seen.push((ray.direction, place));
-            let offset = now.rotation.inverse_transform_vector(&(place - now.centre));
-            let range = offset.norm();
-            // Residual: the predicted direction in the tangent plane of the observed one.
-            let tangents =
-                crossfix_geometry::tangent_basis(&nalgebra::Unit::new_normalize(ray.direction));
-            let seen_at = offset / range;
-            let residual = tangents.transpose() * seen_at;
-            // d(offset / range) / d(offset) = (I - s s') / range
-            let by_offset = tangents.transpose()
-                * (Matrix3::identity() - seen_at * seen_at.transpose())
-                / range;
-            let by_place = by_offset * now.rotation.matrix().transpose();
-            let by_rotation = by_offset * offset.cross_matrix();
-            // d(residual) / d(offset) = d(residual) / d(place) v.
-            let by_time = by_place * velocity;
+            let (residual, rows) = now.residual(&ray.direction, place, velocity);
             // Cauchy's weights, with the scale of the current misfit.
             let weight = (1.0 + residual.norm_squared() / (scale * scale)).recip();
-            let mut rows = SMatrix::<f64, 2, 7>::zeros();
-            rows.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
-            rows.fixed_columns_mut::<3>(3).copy_from(&-by_place);
-            rows.set_column(6, &by_time);
             normal += rows.transpose() * rows * weight;
             right -= rows.transpose() * residual * weight;
         }

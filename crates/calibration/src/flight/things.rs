@@ -261,11 +261,13 @@ impl Joined {
         let states = [0, 1].map(|side| start::state(&own[side], &Course::nowhere(), poses[side]));
         let placed = [0, 1].map(|side| (&sights[side], &states[side]));
         let course = Course::of(&triangulation::log(&placed));
-        let of_camera = |(index, things): (usize, &Things<'_>)| {
+        let labels = things.iter().enumerate().map(|(index, things)| {
             // The two have their pieces already; the others follow the course that these two give.
-            let side = self.cameras.iter().position(|camera| *camera == index);
-            side.map_or_else(|| things.along(course.as_ref()), |side| own[side].clone())
-        };
-        things.iter().enumerate().map(of_camera).collect()
+            match self.cameras.iter().position(|camera| *camera == index) {
+                Some(side) => own[side].clone(),
+                None => things.along(course.as_ref()),
+            }
+        });
+        labels.collect()
     }
 }

@@ -27,12 +27,10 @@ pub(super) fn log(cameras: &[(&Sights, &CameraUnknowns)]) -> FlightLog {
     let steps = ((to - from) / STEP_S).max(0.0) as usize;
     let placed = (0..steps).filter_map(|k| {
         let time_s = from + k as f64 * STEP_S;
-        let seen = |(sights, state): &(&Sights, &CameraUnknowns)| {
-            // At this stage clocks have neither rate nor wander.
-            let direction = sights.at(time_s - state.clock.offset_s)?;
-            Some((state.centre, state.rotation * direction))
-        };
-        let lines: Vec<_> = cameras.iter().filter_map(seen).collect();
+        let lines: Vec<_> = cameras
+            .iter()
+            .filter_map(|(sights, state)| sight_line(sights, state, time_s))
+            .collect();
         let (position, doubt_m) = place(&lines)?;
         Some((LogSample { time_s, position }, doubt_m))
     });
@@ -40,6 +38,17 @@ pub(super) fn log(cameras: &[(&Sights, &CameraUnknowns)]) -> FlightLog {
     doubts.sort_unstable_by(f64::total_cmp);
     let sd_m = doubts.get(doubts.len() / 2).copied().unwrap_or(1.0);
     FlightLog { samples, errors: LogErrors { sd_m, drift_sd_m: 0.0, drift_time_s: 1.0 } }
+}
+
+/// A camera's line of sight to the target at a common time.
+fn sight_line(
+    sights: &Sights,
+    state: &CameraUnknowns,
+    time_s: f64,
+) -> Option<(Point3<f64>, Vector3<f64>)> {
+    // At this stage clocks have neither rate nor wander.
+    let direction = sights.at(time_s - state.clock.offset_s)?;
+    Some((state.centre, state.rotation * direction))
 }
 
 /// The place nearest to all lines (a point and a direction each), and how far it may be off, m.

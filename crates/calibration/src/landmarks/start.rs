@@ -29,18 +29,13 @@ pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<PoseAndLens>, Land
         })?;
         clicked.push((direction.normalize(), landmark.at));
     }
-    let state = |(rotation, centre): (Rotation3<f64>, Point3<f64>)| PoseAndLens {
-        rotation,
-        centre,
-        intrinsics: picture.intrinsics,
-    };
+    let intrinsics = picture.intrinsics;
     // With a known place only the rotation is open, which has one best value.
     if let Some(place) = &picture.place {
-        let turned = turned(&clicked, place.position);
-        return Ok(turned
-            .map(|(_, rotation)| state((rotation, place.position)))
-            .into_iter()
-            .collect());
+        let centre = place.position;
+        let turned = turned(&clicked, centre).into_iter();
+        let starts = turned.map(|(_, rotation)| PoseAndLens { rotation, centre, intrinsics });
+        return Ok(starts.collect());
     }
     let mut tried: Vec<(f64, Rotation3<f64>, Point3<f64>)> = places(picture, angle_of(&clicked))
         .into_iter()
@@ -48,7 +43,8 @@ pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<PoseAndLens>, Land
         .collect();
     tried.sort_by(|a, b| a.0.total_cmp(&b.0));
     tried.truncate(ADJUSTED);
-    Ok(tried.into_iter().map(|(_, rotation, place)| state((rotation, place))).collect())
+    let starts = tried.into_iter();
+    Ok(starts.map(|(_, rotation, centre)| PoseAndLens { rotation, centre, intrinsics }).collect())
 }
 
 /// Root mean square of the clicks' angles from their mean direction, rad.

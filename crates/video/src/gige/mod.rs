@@ -130,12 +130,13 @@ impl GigeCamera {
 /// What the system says where nothing can be sent.
 pub fn gige_cameras(patience: Duration) -> Result<Vec<(Ipv4Addr, String)>, String> {
     let found = blocking::discover(patience).map_err(|error| error.to_string())?;
-    let described = |device: &DeviceInfo| {
-        let words = [&device.manufacturer, &device.model, &device.serial];
-        let words = words.into_iter().flatten().filter(|word| !word.is_empty());
-        words.cloned().collect::<Vec<String>>().join(" ")
-    };
-    Ok(found.iter().map(|device| (device.ip, described(device))).collect())
+    Ok(found.iter().map(|device| (device.ip, name_of(device))).collect())
+}
+
+fn name_of(device: &DeviceInfo) -> String {
+    let words = [&device.manufacturer, &device.model, &device.serial];
+    let words = words.into_iter().flatten().filter(|word| !word.is_empty());
+    words.cloned().collect::<Vec<String>>().join(" ")
 }
 
 /// Which time the camera's stamps are in.
@@ -264,12 +265,10 @@ impl GigeSource {
             self.clock.report(stamp_s, own);
         }
         let (capture, timed_by) = self.clock.time(stamp_s, arrived_s);
-        let by_arrival = |timed_by| {
-            let time = arrived.plus_seconds(-LATENCY.mean_s);
-            (CaptureTime { time, sd_s: LATENCY.sd_s }, timed_by)
-        };
+        let by_arrival =
+            CaptureTime { time: arrived.plus_seconds(-LATENCY.mean_s), sd_s: LATENCY.sd_s };
         if timed_by != TimedBy::Camera {
-            return by_arrival(timed_by);
+            return (by_arrival, timed_by);
         }
         let stamped = CaptureTime {
             // time = stamp + exposure / 2, or stamp - latency if that is given; variances add
@@ -295,7 +294,7 @@ impl GigeSource {
         }
         // A frame that a stall held back is late, but its stamp is as good as ever.
         let is_late = self.is_proven && age_s > 0.0;
-        if is_late { (stamped, TimedBy::Driver) } else { by_arrival(TimedBy::Arrival) }
+        if is_late { (stamped, TimedBy::Driver) } else { (by_arrival, TimedBy::Arrival) }
     }
 
     fn frame(&mut self, block: &Block) -> Result<Frame, VideoError> {

@@ -12,12 +12,12 @@ use mp4_atom::{Avc1, Codec, Decode, FourCC, Moof, Moov, Stbl, StszSamples, Trak,
 
 /// The longest index that is read, bytes: that of a day at 60 frames per second. With half of it
 /// recordings of more than twelve hours at that rate are refused.
-const MAX_INDEX_BYTES: u64 = 128 << 20;
+const MOST_INDEX_BYTES: u64 = 128 << 20;
 /// Most frames of a file: 19 hours at 60 per second. With half of it recordings of more than 9.7
 /// hours at that rate are refused.
-const MAX_SAMPLES: usize = 1 << 22;
+const MOST_SAMPLES: usize = 1 << 22;
 /// A compressed frame longer than this is taken for damage, bytes. With half of it the same.
-const MAX_SAMPLE_BYTES: u64 = 64 << 20;
+const MOST_SAMPLE_BYTES: u64 = 64 << 20;
 
 /// One compressed frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -98,8 +98,8 @@ fn boxes<R: Read + Seek>(file: &mut R) -> Result<(Option<Moov>, Fragments), Stri
     while let Some((kind, size)) = head(file, at, end).map_err(text)? {
         if kind == *b"moov" || kind == *b"moof" {
             read_bytes += size;
-            if read_bytes > MAX_INDEX_BYTES {
-                return Err(format!("its index has more than {MAX_INDEX_BYTES} bytes"));
+            if read_bytes > MOST_INDEX_BYTES {
+                return Err(format!("its index has more than {MOST_INDEX_BYTES} bytes"));
             }
             let mut bytes = vec![0; usize::try_from(size).map_err(|error| error.to_string())?];
             file.seek(SeekFrom::Start(at))
@@ -170,7 +170,7 @@ impl Samples {
     ) -> Result<bool, String> {
         let number = self.samples.len();
         let bytes = u64::from(size);
-        if number >= MAX_SAMPLES || bytes > MAX_SAMPLE_BYTES || size == 0 {
+        if number >= MOST_SAMPLES || bytes > MOST_SAMPLE_BYTES || size == 0 {
             return Err(format!("its frame {number} claims {bytes} bytes"));
         }
         if offset.checked_add(bytes).is_none_or(|ends| ends > self.end) {
@@ -264,24 +264,21 @@ impl Samples {
                     offset = base.saturating_add_signed(i64::from(by));
                 }
                 for (done, entry) in run.samples.iter().enumerate() {
-                    let or = |own: Option<u32>, part: Option<u32>, file: Option<u32>| {
-                        own.or(part).or(file).unwrap_or(0)
-                    };
-                    let size = or(
-                        entry.size,
-                        head.default_sample_size,
-                        usual.map(|u| u.default_sample_size),
-                    );
-                    let flags = or(
-                        entry.flags,
-                        head.default_sample_flags,
-                        usual.map(|u| u.default_sample_flags),
-                    );
-                    let lasts = or(
-                        entry.duration,
-                        head.default_sample_duration,
-                        usual.map(|u| u.default_sample_duration),
-                    );
+                    let size = entry
+                        .size
+                        .or(head.default_sample_size)
+                        .or(usual.map(|u| u.default_sample_size))
+                        .unwrap_or(0);
+                    let flags = entry
+                        .flags
+                        .or(head.default_sample_flags)
+                        .or(usual.map(|u| u.default_sample_flags))
+                        .unwrap_or(0);
+                    let lasts = entry
+                        .duration
+                        .or(head.default_sample_duration)
+                        .or(usual.map(|u| u.default_sample_duration))
+                        .unwrap_or(0);
                     let shift = entry.cts.map_or(0, i64::from);
                     if !self.push(offset, size, flags & IS_NOT_SYNC == 0, shift, lasts)? {
                         // What is left of the run lies beyond the end too, however many it claims.

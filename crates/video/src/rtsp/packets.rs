@@ -78,14 +78,13 @@ fn payloads(unit: &[u8]) -> Vec<Vec<u8>> {
     }
     let chunks: Vec<&[u8]> = body.chunks(LONGEST_PAYLOAD - 2).collect();
     let last = chunks.len() - 1;
-    let part = |(n, chunk): (usize, &&[u8])| {
+    let fragments = chunks.iter().enumerate().map(|(n, chunk)| {
         let start = if n == 0 { 0x80 } else { 0 };
         let end = if n == last { 0x40 } else { 0 };
-        let mut payload = vec![head & 0xe0 | FRAGMENT, start | end | head & 0x1f];
-        payload.extend(*chunk);
-        payload
-    };
-    chunks.iter().enumerate().map(part).collect()
+        let heads = [head & 0xe0 | FRAGMENT, start | end | head & 0x1f];
+        [&heads, *chunk].concat()
+    });
+    fragments.collect()
 }
 
 /// A packet framed for the RTSP connection (RFC 2326, 10.12).

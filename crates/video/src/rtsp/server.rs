@@ -191,12 +191,26 @@ impl Request {
         }
         let mut words = lines.first()?.split(' ');
         let (method, url) = (words.next()?.to_owned(), words.next()?.to_owned());
-        let header = |line: &String| {
-            let (name, value) = line.split_once(':')?;
-            Some((name.trim().to_ascii_lowercase(), value.trim().to_owned()))
-        };
-        Some(Self { method, url, headers: lines.iter().skip(1).filter_map(header).collect() })
+        let headers = lines.iter().skip(1).filter_map(|line| header(line)).collect();
+        Some(Self { method, url, headers })
     }
+
+    /// An answer to it.
+    fn reply(&self, status: &str, headers: &[&str], body: &str) -> String {
+        let number = self.headers.get("cseq").map_or("0", String::as_str);
+        let mut text = format!("RTSP/1.0 {status}\r\nCSeq: {number}\r\n");
+        headers.iter().for_each(|header| text += &format!("{header}\r\n"));
+        if !body.is_empty() {
+            text += &format!("Content-Length: {}\r\n", body.len());
+        }
+        text + "\r\n" + body
+    }
+}
+
+/// Name, in lower case, and value of a header's line.
+fn header(line: &str) -> Option<(String, String)> {
+    let (name, value) = line.split_once(':')?;
+    Some((name.trim().to_ascii_lowercase(), value.trim().to_owned()))
 }
 
 impl Caller {
@@ -238,27 +252,20 @@ impl Caller {
 
     /// The answer, and whether the stream starts after it.
     fn answer(&mut self, request: &Request) -> (String, bool) {
-        let number = request.headers.get("cseq").map_or("0", String::as_str);
-        let reply = |status: &str, headers: &[&str], body: &str| {
-            let mut text = format!("RTSP/1.0 {status}\r\nCSeq: {number}\r\n");
-            headers.iter().for_each(|header| text += &format!("{header}\r\n"));
-            if !body.is_empty() {
-                text += &format!("Content-Length: {}\r\n", body.len());
-            }
-            text + "\r\n" + body
-        };
         let session = format!("Session: {SESSION};timeout=60");
         if !self.is_welcome(request) {
             let ask = "WWW-Authenticate: Basic realm=\"crossfix\"";
-            return (reply("401 Unauthorized", &[ask], ""), false);
+            return (request.reply("401 Unauthorized", &[ask], ""), false);
         }
         let answer = match request.method.as_str() {
-            "OPTIONS" => reply(
+            "OPTIONS" => request.reply(
                 "200 OK",
                 &["Public: OPTIONS, DESCRIBE, SETUP, PLAY, GET_PARAMETER, TEARDOWN"],
                 "",
             ),
-            "GET_PARAMETER" | "SET_PARAMETER" | "TEARDOWN" => reply("200 OK", &[&session], ""),
+            "GET_PARAMETER" | "SET_PARAMETER" | "TEARDOWN" => {
+                request.reply("200 OK", &[&session], "")
+            }
             "DESCRIBE" if self.stream(&request.url).is_some() => {
                 let base = format!("Content-Base: {}/", request.url.trim_end_matches('/'));
                 let body = format!(
@@ -267,25 +274,25 @@ impl Caller {
                      a=rtpmap:{PAYLOAD_TYPE} H264/{CLOCK_HZ}\r\n\
                      a=fmtp:{PAYLOAD_TYPE} packetization-mode=1\r\na=control:video\r\n"
                 );
-                reply("200 OK", &[&base, "Content-Type: application/sdp"], &body)
+                request.reply("200 OK", &[&base, "Content-Type: application/sdp"], &body)
             }
             "SETUP" => match self.stream(&request.url) {
                 Some((path, _)) => {
                     let transport = request.headers.get("transport").map_or("", String::as_str);
                     if !transport.contains("interleaved") {
-                        return (reply("461 Unsupported Transport", &[], ""), false);
+                        return (request.reply("461 Unsupported Transport", &[], ""), false);
                     }
                     self.path = Some(path);
                     let transport = "Transport: RTP/AVP/TCP;unicast;interleaved=0-1";
-                    reply("200 OK", &[transport, &session], "")
+                    request.reply("200 OK", &[transport, &session], "")
                 }
-                None => reply("404 Not Found", &[], ""),
+                None => request.reply("404 Not Found", &[], ""),
             },
             "PLAY" if self.path.is_some() => {
-                return (reply("200 OK", &[&session], ""), true);
+                return (request.reply("200 OK", &[&session], ""), true);
             }
-            "DESCRIBE" | "PLAY" => reply("404 Not Found", &[], ""),
-            _ => reply("501 Not Implemented", &[], ""),
+            "DESCRIBE" | "PLAY" => request.reply("404 Not Found", &[], ""),
+            _ => request.reply("501 Not Implemented", &[], ""),
         };
         (answer, false)
     }

@@ -1,7 +1,7 @@
 //! Cameras of this host on Linux: Video4Linux, version 2.
 
 use std::os::fd::AsRawFd;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crossfix_message::Timestamp;
@@ -229,17 +229,20 @@ fn size_of(device: &Device) -> std::io::Result<[u32; 2]> {
 
 /// Devices that capture, sorted by path, each with the name that it reports.
 pub(super) fn cameras() -> Vec<(PathBuf, String)> {
-    let captures = |path: PathBuf| {
-        let capability = Device::open(&path).ok()?.capabilities().ok()?;
-        let can = capability.device_capabilities();
-        let does =
-            can.contains(CapabilityFlag::VideoCapture) && can.contains(CapabilityFlag::Streaming);
-        does.then(|| (path, capability.card().to_owned()))
-    };
     let devices = Device::list().into_iter().flatten().filter_map(Result::ok);
-    let mut cameras: Vec<(PathBuf, String)> = devices.filter_map(captures).collect();
+    let named = devices.filter_map(|path| name_of(&path).map(|name| (path, name)));
+    let mut cameras: Vec<(PathBuf, String)> = named.collect();
     cameras.sort();
     cameras
+}
+
+/// The name that a device reports; `None` if it does not capture.
+fn name_of(path: &Path) -> Option<String> {
+    let capability = Device::open(path).ok()?.capabilities().ok()?;
+    let can = capability.device_capabilities();
+    let captures =
+        can.contains(CapabilityFlag::VideoCapture) && can.contains(CapabilityFlag::Streaming);
+    captures.then(|| capability.card().to_owned())
 }
 
 /// Sets the camera to a format; returns the format that the driver chose, and the interval between
