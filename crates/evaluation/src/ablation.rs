@@ -39,31 +39,43 @@ impl ClipStart {
     }
 }
 
-/// All parts, and all but one.
-fn configurations() -> impl Iterator<Item = TrackerConfig> {
-    let without = TrackerPart::ALL.map(|part| TrackerConfig::default().without(part));
+/// All parts, and all but each of `parts`.
+fn configurations(parts: &[TrackerPart]) -> impl Iterator<Item = TrackerConfig> {
+    let without = parts.iter().map(|part| TrackerConfig::default().without(*part));
     std::iter::once(TrackerConfig::default()).chain(without)
 }
 
-/// Scores of one run: with all parts, then without each of [`TrackerPart::ALL`].
+/// Scores of one run: with all parts, then without each of some.
 type RunScores = Vec<TrialScore>;
 
-/// The ablation on drawn scenes: a table for each kind of scene, and one for all of them. `runs` of
-/// `options` is the number of scenes of each kind; `progress` is told the number of kinds done, the
-/// number of all, and the next.
+/// What each of `parts` brings on drawn scenes: a table of the frames lost for each kind of scene,
+/// and for all of them that and one of the error of the centre. `runs` of `options` is the number of
+/// scenes of each kind; `progress` is told the number of kinds done, the number of all, and the
+/// next.
+///
+/// ```
+/// use crossfix_evaluation::{ValidationOptions, ablate_drawn};
+///
+/// // No part is left out: how well the tracker does on two scenes of each kind.
+/// let tables = ablate_drawn(ValidationOptions { runs: 2, seed: 5 }, &[], |_, _, _| ());
+/// assert!(tables.iter().all(|table| table.rows[0].series.starts_with("all parts")));
+/// ```
 pub fn ablate_drawn(
     options: ValidationOptions,
+    parts: &[TrackerPart],
     mut progress: impl FnMut(usize, usize, &str),
 ) -> Vec<Table> {
     let (mut tables, mut together) = (Vec::new(), Vec::new());
     for (done, kind) in KINDS.iter().enumerate() {
         progress(done, KINDS.len(), kind.title);
-        let scores = all_runs(options.runs, |run| DrawnRun::new(kind, options.seed, run).scores());
-        tables.push(table(kind.name, kind.title, &scores));
+        let scores =
+            all_runs(options.runs, |run| DrawnRun::new(kind, options.seed, run).scores(parts));
+        tables.push(lost(kind.name, kind.title, &scores, parts));
         together.extend(scores);
     }
     progress(KINDS.len(), KINDS.len(), "");
-    tables.push(table("ablation-drawn", "all drawn scenes", &together));
+    tables.push(lost("ablation-drawn", "all drawn scenes", &together, parts));
+    tables.push(off_centre("ablation-drawn-centre", "all drawn scenes", &together, parts));
     tables
 }
 
@@ -79,9 +91,14 @@ impl ClipAblation {
         self.runs.extend(clip.scores());
     }
 
-    /// The table of all videos so far; every start on each of them is a run.
-    pub fn table(&self) -> Table {
-        table("ablation-clips", "the videos, from four starts", &self.runs)
+    /// The tables of all videos so far, of the frames lost and of the error of the centre; every
+    /// start on each of them is a run.
+    pub fn tables(&self) -> [Table; 2] {
+        let (title, parts) = ("the videos, from four starts", &TrackerPart::ALL);
+        [
+            lost("ablation-clips", title, &self.runs, parts),
+            off_centre("ablation-clips-centre", title, &self.runs, parts),
+        ]
     }
 }
 
@@ -105,7 +122,8 @@ impl ClipAblation {
 /// let mut ablation = ClipAblation::default();
 /// ablation.take(clip);
 /// // With all parts none of the frames is lost.
-/// assert_eq!(ablation.table().rows[0].ours, 0.0);
+/// let [lost, _] = ablation.tables();
+/// assert_eq!(lost.rows[0].ours, 0.0);
 /// ```
 #[derive(Debug)]
 pub struct ClipTrials {
@@ -132,7 +150,9 @@ impl ClipTrials {
         for (start, trials) in STARTS.iter().zip(&mut self.starts) {
             let is_time = time.seconds_since(began) >= start.later_s;
             if let Some(label) = label.filter(|_| is_time && trials.is_empty()) {
-                trials.extend(configurations().filter_map(|c| Trial::new(c, start.of(label))));
+                let given = start.of(label);
+                let all = configurations(&TrackerPart::ALL);
+                trials.extend(all.filter_map(|config| Trial::new(config, given)));
             }
             for trial in trials {
                 trial.step(image, time, label);
@@ -147,28 +167,51 @@ impl ClipTrials {
     }
 }
 
-/// The table of some runs: lost with all parts, and how much more is lost without each.
-fn table(name: &'static str, title: &str, runs: &[RunScores]) -> Table {
-    let lost = |run: &RunScores, index: usize| run.get(index).map_or(f64::NAN, TrialScore::lost);
-    let longest = |index: usize| {
-        let wrong = runs.iter().filter_map(|run| run.get(index)).map(|score| score.longest_wrong_s);
-        wrong.fold(0.0, f64::max)
-    };
-    let with_all: Vec<f64> = runs.iter().map(|run| 100.0 * lost(run, 0)).collect();
-    let mut rows = vec![TableRow::new("all parts: lost, %", longest(0), mean(&with_all))];
-    for (index, part) in (1..).zip(TrackerPart::ALL) {
-        // The same images: the difference of each run, so that what is hard in it cancels.
-        let more: Vec<f64> =
-            runs.iter().map(|run| 100.0 * (lost(run, index) - lost(run, 0))).collect();
-        rows.push(TableRow::new(format!("without: {part}"), longest(index), mean(&more)));
-    }
+/// The frames lost in some runs with all parts, and how many more without each.
+fn lost(name: &'static str, title: &str, runs: &[RunScores], parts: &[TrackerPart]) -> Table {
     Table {
         name,
-        title: format!("What each part of the tracker brings on {title}"),
+        title: format!("What each part of the tracker brings on {title}: frames not lost"),
         x: "wrong for, s",
         y: "lost without it, less with all, %",
-        rows,
+        rows: rows(runs, parts, "lost, %", |score| 100.0 * score.lost()),
     }
+}
+
+/// The error of the centre while the target is followed, with all parts, and how much larger it is
+/// without each.
+fn off_centre(name: &'static str, title: &str, runs: &[RunScores], parts: &[TrackerPart]) -> Table {
+    Table {
+        name,
+        title: format!("What each part of the tracker brings on {title}: the centre"),
+        x: "wrong for, s",
+        y: "RMS without it, less with all, px",
+        rows: rows(runs, parts, "RMS, px", TrialScore::rms_px),
+    }
+}
+
+/// Rows of a figure with all parts, then of what is added to it without each.
+fn rows(
+    runs: &[RunScores],
+    parts: &[TrackerPart],
+    unit: &str,
+    figure: impl Fn(&TrialScore) -> f64,
+) -> Vec<TableRow> {
+    let figures = |index: usize| runs.iter().map(move |run| &run[index]).map(&figure);
+    let with_all: Vec<f64> = figures(0).collect();
+    let row = |series: String, index: usize, values: &[f64]| {
+        let wrong = runs.iter().map(|run| run[index].longest_wrong_s).fold(0.0, f64::max);
+        TableRow::new(series, wrong, mean(values))
+    };
+    let without = (1..).zip(parts).map(|(index, part)| {
+        // The same images: the difference of each run, so that what is hard in it cancels. A run
+        // that is lost at once has no centre.
+        let more = figures(index).zip(&with_all).map(|(one, all)| one - all);
+        let more: Vec<f64> = more.filter(|more| more.is_finite()).collect();
+        row(format!("without: {part}"), index, &more)
+    });
+    let known: Vec<f64> = with_all.iter().copied().filter(|all| all.is_finite()).collect();
+    std::iter::once(row(format!("all parts: {unit}"), 0, &known)).chain(without).collect()
 }
 
 /// Whether a track claims to be on its target.

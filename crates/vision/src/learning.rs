@@ -14,10 +14,16 @@ const USUAL_S: f64 = 3.0;
 /// cloud's edge. With half of it a target that is still dimmed is expected too bright, and found
 /// later.
 const FADES_S: f64 = 0.5;
-/// Correlations up to which an image is not learned at all, and from which on it is learned fully.
-/// With half of them an image that shares an eighth of its energy with the target (`0.35^2`) is
-/// learned fully.
-const LEARNING_SCORES: [f64; 2] = [0.35, 0.70];
+/// Matches, as shares of the usual one, up to which an image is not learned at all, and from which
+/// on it is learned fully. A target changes its looks by little from image to image; an image that
+/// suddenly matches worse has something else in it, a mast or a bird. With half of the second a
+/// reference learns the mast that it passes: twice as many frames are lost on drawn scenes of
+/// masts, and on infrared video something else is followed for a second instead of a third.
+const LEARNING_MATCHES: [f64; 2] = [0.7, 0.95];
+/// Averaging time of the usual match, s. With half of it an image of drawn sequences in ten is lost
+/// more; with three times as much a target that turns is learnt too slowly: on infrared video twice
+/// as many frames are lost.
+const USUAL_MATCH_S: f64 = 1.0;
 /// Certainties below which nothing is learnt from an image, before and after its correlation is
 /// weighed in. With half of them hardly anything changes: the certainty is the weight of what is
 /// learnt.
@@ -55,22 +61,15 @@ impl TargetBelief {
         }
         let seen = certainty > SEEN;
         if seen && config.has(TrackerPart::FollowedContrast) {
-            let clear = f64::from(self.appearance.clear_share());
-            // The reference's noise is taken out: z / clear, with the variance v / (E clear^2).
-            let measured = fit.contrast / clear;
-            let variance = f64::from(self.noise / self.appearance.energy().max(1e-12))
-                / clear.powi(2)
-                + CONTRAST_FLOOR.powi(2);
-            // Kalman filter of the contrast: P grows by the walk, gain = certainty P / (P + R).
-            self.contrast_variance += (CONTRAST_WALK * self.contrast).powi(2) * interval;
-            let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
-            self.contrast = (self.contrast + gain * (measured - self.contrast)).clamp(0.2, 5.0);
-            self.contrast_variance *= 1.0 - gain;
-            let share = (certainty * interval / USUAL_S).min(1.0);
-            self.usual_contrast += share * (self.contrast - self.usual_contrast);
+            self.follow_contrast(fit.contrast, certainty, interval);
         }
-        let certainty = certainty * ramp(fit.score, LEARNING_SCORES);
-        if certainty < LEAST_CERTAINTY[1] {
+        let match_now = fit.score.max(0.0) / self.correlation_in_noise();
+        let learnt = certainty * ramp(match_now / self.usual_match, LEARNING_MATCHES);
+        if seen {
+            let share = (certainty * interval / USUAL_MATCH_S).min(1.0);
+            self.usual_match += share * (match_now - self.usual_match);
+        }
+        if learnt < LEAST_CERTAINTY[1] {
             return 0.0;
         }
         // Size and direction take effect only with the learning; without it they would run
@@ -78,11 +77,37 @@ impl TargetBelief {
         if seen && self.appearance.is_in_shape() {
             self.follow_shape(fit);
         }
-        let (certainty, buffers) = (certainty as f32, &mut scratch.buffers);
-        let share = self.appearance.learn(image, place, self.noise, certainty, interval, buffers);
+        let (learnt, buffers) = (learnt as f32, &mut scratch.buffers);
+        let share = self.appearance.learn(image, place, self.noise, learnt, interval, buffers);
         let variances = [fit.covariance.m11, fit.covariance.m22];
         self.motion.learn(place, f64::from(share), Some(variances));
-        certainty
+        learnt
+    }
+
+    /// Follows the target's contrast, and the usual one, by what was measured in an image.
+    fn follow_contrast(&mut self, measured: f64, certainty: f64, interval: f64) {
+        let clear = f64::from(self.appearance.clear_share());
+        // The reference's noise is taken out: z / clear, with the variance v / (E clear^2).
+        let measured = measured / clear;
+        let variance = f64::from(self.noise / self.appearance.energy().max(1e-12)) / clear.powi(2)
+            + CONTRAST_FLOOR.powi(2);
+        // Kalman filter of the contrast: P grows by the walk, gain = certainty P / (P + R).
+        self.contrast_variance += (CONTRAST_WALK * self.contrast).powi(2) * interval;
+        let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
+        self.contrast = (self.contrast + gain * (measured - self.contrast)).clamp(0.2, 5.0);
+        self.contrast_variance *= 1.0 - gain;
+        let share = (certainty * interval / USUAL_S).min(1.0);
+        self.usual_contrast += share * (self.contrast - self.usual_contrast);
+    }
+
+    /// The correlation of a reference with the target's next image, if nothing but noise parts them:
+    /// `sqrt(k c^2 k E / (c^2 k E + n v))`, with the reference's energy E over n pixels, of which the
+    /// share k is the target's, the target's contrast c and the image's noise v.
+    fn correlation_in_noise(&self) -> f64 {
+        let clear = f64::from(self.appearance.clear_share());
+        let own = self.contrast.powi(2) * clear * f64::from(self.appearance.energy());
+        let noise = f64::from(self.appearance.pixels() * self.noise);
+        (clear * own / (own + noise)).sqrt().max(f64::MIN_POSITIVE)
     }
 
     fn follow_shape(&mut self, fit: TargetFit) {

@@ -95,13 +95,6 @@ pub(crate) struct PlaceEvidence {
     pub(crate) elsewhere_at: [AxisMeasurement; 2],
 }
 
-impl PlaceEvidence {
-    /// Evidence of a measurement that is not doubted.
-    pub(crate) fn of(at: [AxisMeasurement; 2]) -> Self {
-        Self { near: 1.0, at, elsewhere: 0.0, elsewhere_at: at }
-    }
-}
-
 impl ImageMotion {
     /// Motion of a target at rest, whose given place, on both axes, has become the middle of its
     /// reference. The error of the given place is in the position and with the opposite sign in the
@@ -444,17 +437,6 @@ impl ImageMotion {
                         + new * new.transpose() * variances[i];
                 }
             }
-        }
-        self.combine();
-    }
-
-    /// Multiplies the variances of position and velocity by `factor`: less is known of them than
-    /// the filters believe. The offset's variance stays.
-    pub(crate) fn inflate(&mut self, factor: f64) {
-        let root = factor.sqrt();
-        let wider = Matrix3::from_diagonal(&Vector3::new(root, root, 1.0));
-        for axis in self.ways.iter_mut().flatten() {
-            axis.covariance = wider * axis.covariance * wider;
         }
         self.combine();
     }

@@ -50,6 +50,8 @@ pub(crate) struct TargetBelief {
     pub(crate) contrast_variance: f64,
     /// Mean contrast over seconds in which the target is seen.
     pub(crate) usual_contrast: f64,
+    /// Mean correlation over about a second, as a share of that which noise leaves.
+    pub(crate) usual_match: f64,
     /// Variances of the log scale and of the turn.
     pub(crate) shape_variances: [f64; 2],
     /// Number of images without it since it was last seen, ...
@@ -93,6 +95,7 @@ impl TargetBelief {
             contrast: 1.0,
             contrast_variance: 0.0,
             usual_contrast: 1.0,
+            usual_match: 1.0,
             shape_variances: CUT_OUT_SHAPE,
             missed: 0,
             unseen_s: 0.0,

@@ -24,8 +24,6 @@ pub enum TrackerPart {
     MotionModels,
     /// The measurement noise is matched to the innovations.
     MatchedNoise,
-    /// A certain match far from the prediction widens the filters.
-    Manoeuvres,
     /// Several places are followed while none is sure.
     SeveralPlaces,
     /// The camera's turns are found by registration, and the target may turn with the scene.
@@ -48,7 +46,7 @@ pub enum TrackerPart {
 
 impl TrackerPart {
     /// All parts.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 16] = [
         Self::Figure,
         Self::MeanFigure,
         Self::LearntReference,
@@ -56,7 +54,6 @@ impl TrackerPart {
         Self::FollowedContrast,
         Self::MotionModels,
         Self::MatchedNoise,
-        Self::Manoeuvres,
         Self::SeveralPlaces,
         Self::CameraTurns,
         Self::Arrival,
@@ -79,7 +76,6 @@ impl fmt::Display for TrackerPart {
             Self::FollowedContrast => "the contrast is followed",
             Self::MotionModels => "several motion models",
             Self::MatchedNoise => "noise matched to innovations",
-            Self::Manoeuvres => "manoeuvres widen the filters",
             Self::SeveralPlaces => "several places while in doubt",
             Self::CameraTurns => "turns of the camera",
             Self::Arrival => "identity: it has come there",

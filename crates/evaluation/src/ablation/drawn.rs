@@ -9,7 +9,7 @@ use crossfix_simulation::{
     FlightPath, Scene, SceneCamera, SceneClutter, SceneMount, SceneTarget, SimulatedCamera,
     SimulatedClock,
 };
-use crossfix_vision::{ImagePoint, PixelBox};
+use crossfix_vision::{ImagePoint, PixelBox, TrackerPart};
 use nalgebra::Point3;
 
 use super::trial::Trial;
@@ -192,8 +192,8 @@ impl DrawnRun {
         Self { camera: world.cameras()[0].clone(), path, pan_rad: kind.pan_rad }
     }
 
-    /// Follows the target with all parts, and without each.
-    pub(super) fn scores(&self) -> RunScores {
+    /// Follows the target with all parts, and without each of some.
+    pub(super) fn scores(&self, parts: &[TrackerPart]) -> RunScores {
         let mut trials: Vec<Trial> = Vec::new();
         for index in 0..self.camera.frames() {
             let angles = self.angles(index);
@@ -207,7 +207,7 @@ impl DrawnRun {
                 let mut centre = label.centre();
                 centre.x += ASIDE_PX;
                 let given = PixelBox::about(centre, LARGER * label.width, LARGER * label.height);
-                trials.extend(configurations().filter_map(|config| Trial::new(config, given)));
+                trials.extend(configurations(parts).filter_map(|config| Trial::new(config, given)));
             }
             let time = Timestamp::from_seconds(rendered.own_s);
             trials.iter_mut().for_each(|trial| trial.step(&image, time, label));

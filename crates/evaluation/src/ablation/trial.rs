@@ -20,6 +20,8 @@ const GIVEN: ImageTrackId = ImageTrackId(1);
 pub(super) struct TrialScore {
     labelled: u32,
     near: u32,
+    /// Sum of the squared distances in those frames, px^2.
+    squares: f64,
     /// Longest time for which something else was claimed to be the target, s.
     pub(super) longest_wrong_s: f64,
 }
@@ -28,6 +30,12 @@ impl TrialScore {
     /// Share of the labelled frames in which the target was not followed.
     pub(super) fn lost(&self) -> f64 {
         1.0 - f64::from(self.near) / f64::from(self.labelled)
+    }
+
+    /// Root mean square error of the centre while the target was followed, px; not a number where it
+    /// never was.
+    pub(super) fn rms_px(&self) -> f64 {
+        (self.squares / f64::from(self.near)).sqrt()
     }
 }
 
@@ -56,7 +64,10 @@ impl Trial {
         let off =
             claimed.map(|track| (track.position.x - truth.x).hypot(track.position.y - truth.y));
         self.score.labelled += 1;
-        self.score.near += u32::from(off.is_some_and(|off| off <= NEAR_PX));
+        if let Some(near) = off.filter(|off| *off <= NEAR_PX) {
+            self.score.near += 1;
+            self.score.squares += near * near;
+        }
         if off.is_some_and(|off| off > FAR_PX) {
             let since = *self.wrong_since.get_or_insert(time);
             let wrong_s = time.seconds_since(since);

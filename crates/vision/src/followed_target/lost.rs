@@ -2,7 +2,7 @@
 
 use crossfix_filter::AxisMeasurement;
 
-use super::{MANOEUVRE, Target};
+use super::Target;
 use crate::frame::{FrameInput, TargetStep};
 use crate::scratch::Scratch;
 use crate::search::Sought;
@@ -13,6 +13,10 @@ use crate::search::Sought;
 /// a target that a cloud hides for longer than a third of a second, at 30 images per second, loses
 /// its velocity.
 const CONTINUES_IMAGES: u32 = 20;
+/// Squared distance from the prediction up to which a place is near it, on either axis, over the
+/// prediction's variance. With half of it one right place in 1200 begins the motion anew by chance,
+/// instead of one in a million.
+const CONTINUES_WITHIN: f64 = 25.0;
 
 impl Target {
     pub(super) fn search(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> TargetStep {
@@ -35,7 +39,8 @@ impl Target {
         self.identity.begin_probation(&self.state, frame);
         let (found, expected) = (fit.found(), self.state.motion.found());
         let is_near = |i: usize| {
-            (found[i].position - expected[i].position).powi(2) < MANOEUVRE * expected[i].variance
+            (found[i].position - expected[i].position).powi(2)
+                < CONTINUES_WITHIN * expected[i].variance
         };
         if self.state.missed < CONTINUES_IMAGES && is_near(0) && is_near(1) {
             self.state.motion.condition([0, 1].map(|i| AxisMeasurement {

@@ -33,13 +33,6 @@ const NARROW: f64 = 0.5;
 /// Least gain of a measurement that is taken out of a peak of the map: with less, chance would be
 /// taken for a measurement far off the prediction.
 const LEAST_TOLD: f64 = 0.1;
-/// Squared normalised innovation beyond which a certain match is taken for a manoeuvre. With half
-/// of it one image in 500 is one by chance: at 30 per second, one in 17 s.
-const MANOEUVRE: f64 = 25.0;
-/// Largest factor by which a manoeuvre inflates the filters' variances: from a tenth of a pixel to
-/// ten. With half of it jumps of more than 350 standard deviations are followed with a lag, instead
-/// of more than 500.
-const MOST_INFLATED: f64 = 1e4;
 /// Largest product of the half sides of a gate in which a target in doubt is looked for, px^2: a
 /// gate of 280 by 280 px takes 10 ms. With no limit it grows to the whole image, and takes 60. With
 /// half of it a drawn target in noise is lost in 20 % of its frames instead of 2, and something
@@ -233,7 +226,6 @@ impl Target {
         if certainty > SEEN {
             self.state.motion.tell_noise(found.map(|at| at.variance));
         }
-        let expected = self.state.motion.found();
         let distance = self.state.motion.nis(found);
         let step =
             |measured| TargetStep { measured, score: fit.score, certainty, nis: Some(distance) };
@@ -243,20 +235,6 @@ impl Target {
         {
             self.state.missed += 1;
             return step(None);
-        }
-        let may_widen = frame.config.has(TrackerPart::Manoeuvres);
-        if may_widen && certainty > SEEN && distance > MANOEUVRE {
-            // Certain, but not where it was expected: the filters are overconfident.
-            let off = |i: usize| {
-                (found[i].position - expected[i].position).powi(2) / expected[i].variance
-            };
-            // Widened by as much as brings the innovation back to the limit; then the fit is taken
-            // without doubt.
-            self.state.motion.inflate((off(0).max(off(1)) / MANOEUVRE).clamp(1.0, MOST_INFLATED));
-            self.state.motion.update(&PlaceEvidence::of(found));
-            self.seen(fit.place);
-            self.learn(frame, fit.place, fit, certainty, scratch);
-            return step(Some(measured));
         }
         // Whether what is followed is the target is said by the certainty; the covariance is that
         // of its place if it is.

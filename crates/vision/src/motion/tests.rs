@@ -54,7 +54,7 @@ impl Flight {
         });
         self.motion.tell_noise([variance; 2]);
         let nis = self.motion.nis(at);
-        self.motion.update(&PlaceEvidence::of(at));
+        self.motion.update(&PlaceEvidence { near: 1.0, at, elsewhere: 0.0, elsewhere_at: at });
         self.motion.match_noise(nis);
         let place = self.motion.position();
         let share = if self.images < 20.0 { 1.0 / (self.images + 1.0) } else { 0.0 };

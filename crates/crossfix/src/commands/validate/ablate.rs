@@ -6,6 +6,7 @@ use std::time::Instant;
 use anyhow::{Context, ensure};
 use crossfix_evaluation::{ClipAblation, ClipTrials, Table, ValidationOptions, ablate_drawn};
 use crossfix_video::FrameClock;
+use crossfix_vision::TrackerPart;
 
 use crate::commands::labels::read_labels;
 use crate::commands::track::next_frame;
@@ -19,14 +20,14 @@ pub(super) fn tables(
     mut progress: impl FnMut(usize, usize, &str),
 ) -> anyhow::Result<Vec<Table>> {
     let videos = clips.map_or(Ok(Vec::new()), labelled_videos)?;
-    let mut tables = ablate_drawn(options, &mut progress);
+    let mut tables = ablate_drawn(options, &TrackerPart::ALL, &mut progress);
     let mut ablation = ClipAblation::default();
     for (done, video) in videos.iter().enumerate() {
         progress(done, videos.len(), &video.display().to_string());
         ablation.take(follow(video)?);
     }
     if !videos.is_empty() {
-        tables.push(ablation.table());
+        tables.extend(ablation.tables());
     }
     Ok(tables)
 }
