@@ -234,21 +234,24 @@ mod tests {
         }
     }
 
+    /// The middle of the brightness of what is drawn at a place.
+    fn middle_of_drawn(silhouette: &Silhouette, place: [f64; 2]) -> [f64; 2] {
+        let mut image = vec![0.0_f32; 60 * 50];
+        silhouette.draw(&mut image, 60, place, 1.0);
+        let (mut sum, mut moments) = (0.0, [0.0; 2]);
+        for (i, brightness) in image.into_iter().map(f64::from).enumerate() {
+            sum += brightness;
+            moments[0] += (i % 60) as f64 * brightness;
+            moments[1] += (i / 60) as f64 * brightness;
+        }
+        moments.map(|moment| moment / sum)
+    }
+
     #[test]
     fn what_is_drawn_lies_where_it_is_drawn() {
         let silhouette = Silhouette::new(25, 15);
-        let middle = |x: f64, y: f64| {
-            let mut image = vec![0.0_f32; 60 * 50];
-            silhouette.draw(&mut image, 60, [x, y], 1.0);
-            let sum: f64 = image.iter().map(|b| f64::from(*b)).sum();
-            let first = |of: &dyn Fn(usize) -> usize| {
-                image.iter().enumerate().map(|(i, b)| of(i) as f64 * f64::from(*b)).sum::<f64>()
-                    / sum
-            };
-            (first(&|i| i % 60), first(&|i| i / 60))
-        };
-        let (x0, y0) = middle(30.0, 25.0);
-        let (x1, y1) = middle(30.37, 24.2);
+        let [x0, y0] = middle_of_drawn(&silhouette, [30.0, 25.0]);
+        let [x1, y1] = middle_of_drawn(&silhouette, [30.37, 24.2]);
         assert!((x1 - x0 - 0.37).abs() < 1e-3 && (y1 - y0 + 0.8).abs() < 1e-3);
         // The silhouette is symmetric from left to right.
         assert!((x0 - 30.0).abs() < 1e-3);
