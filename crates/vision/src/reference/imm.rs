@@ -203,7 +203,7 @@ impl EightPixels {
     #[inline(always)]
     fn mixed(&self, l: usize, stay: f32) -> (Lanes, EightStates) {
         let leave = (1.0 - stay) / (MODELS - 1) as f32;
-        let zero = Lanes::splat(0.0);
+        let (zero, states) = (Lanes::splat(0.0), &self.states);
         // (10): the probability of each model before, given that l holds now.
         let mut weights = self.probabilities;
         let mut prior = zero;
@@ -214,18 +214,18 @@ impl EightPixels {
         let share = Lanes::splat(1.0) / prior;
         // (11): mixed state and covariance.
         let [mut brightness, mut rate] = [zero; 2];
-        for (weight, state) in weights.iter_mut().zip(&self.states) {
-            *weight = *weight * share;
-            brightness = brightness + *weight * state[0];
-            rate = rate + *weight * state[1];
+        for m in 0..MODELS {
+            weights[m] = weights[m] * share;
+            brightness = brightness + weights[m] * states[m][0];
+            rate = rate + weights[m] * states[m][1];
         }
         // P = sum w_m (P_m + d d'), d = x_m - x: the spread of the means is part of it.
         let [mut p11, mut p12, mut p22] = [zero; 3];
-        for (weight, state) in weights.into_iter().zip(&self.states) {
-            let (d0, d1) = (state[0] - brightness, state[1] - rate);
-            p11 = p11 + weight * (state[2] + d0 * d0);
-            p12 = p12 + weight * (state[3] + d0 * d1);
-            p22 = p22 + weight * (state[4] + d1 * d1);
+        for m in 0..MODELS {
+            let (d0, d1) = (states[m][0] - brightness, states[m][1] - rate);
+            p11 = p11 + weights[m] * (states[m][2] + d0 * d0);
+            p12 = p12 + weights[m] * (states[m][3] + d0 * d1);
+            p22 = p22 + weights[m] * (states[m][4] + d1 * d1);
         }
         (prior, [brightness, rate, p11, p12, p22])
     }
