@@ -304,8 +304,8 @@ fn figure_within(
     (region.weight >= f64::from(LEAST_SHARE * all)).then(|| region.place(corner, least))
 }
 
-/// Probability, up to a factor, that a pixel was meant by a given box: inside it as great as that of
-/// any other pixel there; outside, it falls off with the distance as a Gaussian.
+/// Probability, up to a factor, that a pixel was meant by a given box: inside it as great as that
+/// of any other pixel there; outside, it falls off with the distance as a Gaussian.
 #[inline]
 fn likely_meant(given: PixelBox, given_sd: f64, [x, y]: [usize; 2]) -> f32 {
     let centre = given.centre();

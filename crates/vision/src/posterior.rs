@@ -2,8 +2,8 @@
 //! times the prior by the motion, summed to mean, covariance, and the probability that it is not
 //! there at all.
 //!
-//! The sum has tens of thousands of terms, so it is computed by SIMD in single precision; weights are
-//! taken relative to the largest, so that no exponential overflows.
+//! The sum has tens of thousands of terms, so it is computed by SIMD in single precision; weights
+//! are taken relative to the largest, so that no exponential overflows.
 
 use crossfix_correlation::Plane;
 use pulp::{Arch, Simd, WithSimd};
