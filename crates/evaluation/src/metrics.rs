@@ -150,6 +150,12 @@ struct ErrorSums {
     pairs: u64,
 }
 
+/// NEES of three components of a state, from the first of them on.
+fn nees_from(state: &KinematicState, first: usize, error: &Vector3<f64>) -> f64 {
+    let spread = state.covariance.fixed_view::<3, 3>(first, first).into_owned().cholesky();
+    spread.map_or(f64::INFINITY, |c| error.dot(&c.solve(error)))
+}
+
 impl ErrorSums {
     fn add(&mut self, truth: &TrueTarget, state: &KinematicState) {
         let position = state.position() - truth.position;
@@ -160,13 +166,9 @@ impl ErrorSums {
         // A covariance that cannot be inverted is consistent with no error.
         let both =
             state.covariance.cholesky().map_or(f64::INFINITY, |c| error.dot(&c.solve(&error)));
-        let part = |from: usize, error: &Vector3<f64>| {
-            let spread = state.covariance.fixed_view::<3, 3>(from, from).into_owned().cholesky();
-            spread.map_or(f64::INFINITY, |c| error.dot(&c.solve(error)))
-        };
-        for (list, value) in
-            self.nees.iter_mut().zip([both, part(0, &position), part(3, &velocity)])
-        {
+        let [of_position, of_velocity] =
+            [(0, position), (3, velocity)].map(|(first, error)| nees_from(state, first, &error));
+        for (list, value) in self.nees.iter_mut().zip([both, of_position, of_velocity]) {
             list.push(value);
         }
         self.pairs += 1;

@@ -38,6 +38,25 @@ struct Stretch {
     answered: Option<Timestamp>,
 }
 
+impl Stretch {
+    /// From its begin to its first answer, s.
+    fn delay_s(&self) -> f64 {
+        self.answered.map_or(f64::INFINITY, |answered| answered.seconds_since(self.from))
+    }
+
+    /// Whether it could have been answered.
+    fn counts(&self) -> bool {
+        self.answered.is_some() || self.to.seconds_since(self.from) > LEAST_S
+    }
+}
+
+/// From the begin of a target's first stretch to the first answer in any of them, s.
+fn first_delay_s(stretches: &[Stretch]) -> f64 {
+    let begun = stretches.first().map(|stretch| stretch.from);
+    let answered = stretches.iter().find_map(|stretch| stretch.answered);
+    answered.zip(begun).map_or(f64::INFINITY, |(answered, begun)| answered.seconds_since(begun))
+}
+
 /// The stretches of all targets.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Stretches(BTreeMap<u64, Vec<Stretch>>);
@@ -59,23 +78,12 @@ impl Stretches {
     }
 
     pub(crate) fn delays(&self) -> Delays {
-        let delay = |stretch: &Stretch| {
-            stretch.answered.map_or(f64::INFINITY, |answered| answered.seconds_since(stretch.from))
-        };
-        let counts = |stretch: &&Stretch| {
-            stretch.answered.is_some() || stretch.to.seconds_since(stretch.from) > LEAST_S
-        };
-        let first = |stretches: &Vec<Stretch>| {
-            let answered = stretches.iter().find_map(|stretch| stretch.answered);
-            let waited =
-                |begun: &Stretch| answered.map(|answered| answered.seconds_since(begun.from));
-            stretches.first().and_then(waited).unwrap_or(f64::INFINITY)
-        };
-        let first_s = self.0.values().map(first).fold(0.0, f64::max);
+        let first_s = self.0.values().map(|stretches| first_delay_s(stretches)).fold(0.0, f64::max);
         let returns = self.0.values().flat_map(|stretches| stretches.iter().skip(1));
-        let mut nexts: Vec<f64> = returns.filter(counts).map(delay).collect();
+        let mut nexts: Vec<f64> =
+            returns.filter(|stretch| stretch.counts()).map(Stretch::delay_s).collect();
         nexts.sort_by(f64::total_cmp);
-        let all = self.0.values().flatten().filter(counts);
+        let all = self.0.values().flatten().filter(|stretch| stretch.counts());
         Delays {
             first_s: (first_s.is_finite() && !self.0.is_empty()).then_some(first_s),
             returns: nexts.len() as u64,

@@ -114,13 +114,8 @@ impl SceneClutter {
                 pieces(camera, at, *width_m, *level)
             }
             Self::Wire { from_m, to_m, sag_m, width_m, level } => {
-                let (from, to) = (Point3::from(*from_m), Point3::from(*to_m));
-                // z -= 4 sag s (1 - s): 0 at both ends, `sag` in the middle.
-                let at = |share: f64| {
-                    from + (to - from) * share
-                        - Vector3::z() * (4.0 * sag_m * share * (1.0 - share))
-                };
-                pieces(camera, at, *width_m, *level)
+                let ends = [Point3::from(*from_m), Point3::from(*to_m)];
+                pieces(camera, |share| wire_point(ends, *sag_m, share), *width_m, *level)
             }
             Self::Bird { span_m, beats_per_s, level, path } => {
                 let up = BEAT_RAD * (TAU * beats_per_s * t).sin();
@@ -139,6 +134,12 @@ impl SceneClutter {
             }
         }
     }
+}
+
+/// The point of a wire at a share of the way between its ends.
+fn wire_point([from, to]: [Point3<f64>; 2], sag_m: f64, share: f64) -> Point3<f64> {
+    // z -= 4 sag s (1 - s): 0 at both ends, `sag` in the middle.
+    from + (to - from) * share - Vector3::z() * (4.0 * sag_m * share * (1.0 - share))
 }
 
 /// A point as a camera sees it.

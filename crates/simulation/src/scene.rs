@@ -194,25 +194,43 @@ impl SceneTarget {
 
 impl SceneCamera {
     fn check(&self) -> Result<(), SceneError> {
-        let in_range = |key: &str, value: f64, range: RangeInclusive<f64>, must: &'static str| {
-            number(format!("{key} of camera {}", self.name), value, range.contains(&value), must)
-        };
-        in_range("rate_hz", self.rate_hz, 0.01..=1000.0, "from 0.01 to 1000 frames a second")?;
-        in_range("noise_levels", self.noise_levels, 0.0..=100.0, "from 0 to 100 levels")?;
-        in_range("blur_px", self.blur_px, 0.0..=20.0, "from 0 to 20 px")?;
-        in_range("exposure_s", self.exposure_s, 0.0..=1.0, "from 0 to 1 s")?;
+        self.in_range("rate_hz", self.rate_hz, 0.01..=1000.0, "from 0.01 to 1000 frames a second")?;
+        self.in_range("noise_levels", self.noise_levels, 0.0..=100.0, "from 0 to 100 levels")?;
+        self.in_range("blur_px", self.blur_px, 0.0..=20.0, "from 0 to 20 px")?;
+        self.in_range("exposure_s", self.exposure_s, 0.0..=1.0, "from 0 to 1 s")?;
         if let Some(SceneMount { rate_deg_per_s: rate, angle_sd_mrad: sd, .. }) = self.mount {
             let turns = "from 0.01 to 1000 degrees a second";
-            in_range("mount.rate_deg_per_s", rate, 0.01..=1000.0, turns)?;
-            in_range("mount.angle_sd_mrad", sd, 0.0..=100.0, "from 0 to 100 mrad")?;
+            self.in_range("mount.rate_deg_per_s", rate, 0.01..=1000.0, turns)?;
+            self.in_range("mount.angle_sd_mrad", sd, 0.0..=100.0, "from 0 to 100 mrad")?;
         }
         let most = self.size_px.iter().copied().max().unwrap_or(0);
-        in_range("size_px", f64::from(most), 0.0..=8192.0, "at most 8192 px")
+        self.in_range("size_px", f64::from(most), 0.0..=8192.0, "at most 8192 px")
+    }
+
+    /// An error where a number of it is not in its range.
+    fn in_range(
+        &self,
+        key: &str,
+        value: f64,
+        range: RangeInclusive<f64>,
+        must: &'static str,
+    ) -> Result<(), SceneError> {
+        in_range(format!("{key} of camera {}", self.name), value, range, must)
     }
 }
 
 fn is_positive(value: f64) -> bool {
     value.is_finite() && value > 0.0
+}
+
+/// An error where a number is not in its range.
+pub(crate) fn in_range(
+    what: impl Into<String>,
+    value: f64,
+    range: RangeInclusive<f64>,
+    must: &'static str,
+) -> Result<(), SceneError> {
+    number(what.into(), value, range.contains(&value), must)
 }
 
 /// An error where a number is not good.

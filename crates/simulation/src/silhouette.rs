@@ -1,6 +1,8 @@
 //! Drone silhouettes with the sizes, contrasts and energies of Lytvynets 2020, table 1, drawn at
 //! any place, size and angle.
 
+use std::ops::Range;
+
 /// Number of sub-samples per pixel and axis. With half of it the arm of the smallest silhouette,
 /// 0.9 px thick, has fewer than four samples across.
 const SUPERSAMPLING: usize = 8;
@@ -162,13 +164,8 @@ impl Silhouette {
     /// `centre`.
     pub fn draw(&self, image: &mut [f32], width: usize, centre: [f64; 2], strength: f32) {
         let height = image.len() / width;
-        let range = |centre: f64, reach: f64, side: usize| {
-            let first = (centre - reach).max(0.0) as usize;
-            let end = ((centre + reach).max(0.0) as usize + 1).min(side);
-            first..end.max(first)
-        };
-        for y in range(centre[1], self.reach[1], height) {
-            for x in range(centre[0], self.reach[0], width) {
+        for y in pixels_within(centre[1], self.reach[1], height) {
+            for x in pixels_within(centre[0], self.reach[0], width) {
                 image[y * width + x] +=
                     strength * self.pixel(x as f64 - centre[0], y as f64 - centre[1]);
             }
@@ -186,32 +183,39 @@ impl Silhouette {
     }
 }
 
+/// The columns (or rows) of an image of `side` of them that lie within `reach` of a place.
+fn pixels_within(place: f64, reach: f64, side: usize) -> Range<usize> {
+    let first = (place - reach).max(0.0) as usize;
+    let end = ((place + reach).max(0.0) as usize + 1).min(side);
+    first..end.max(first)
+}
+
 /// Filters along the rows and the columns with a kernel normalised to sum to 1; samples outside
 /// count as 0.
 fn filtered(samples: &[f32], columns: usize, kernel: &[f64]) -> Vec<f32> {
+    let along = filtered_along(samples, 1, columns, kernel);
+    filtered_along(&along, columns, samples.len() / columns, kernel)
+}
+
+/// Filters along lines of `count` samples that lie `stride` apart.
+fn filtered_along(samples: &[f32], stride: usize, count: usize, kernel: &[f64]) -> Vec<f32> {
     let sum: f64 = kernel.iter().sum();
-    let (rows, half) = (samples.len() / columns, kernel.len() / 2);
-    let pass =
-        |from: &[f32], stride: usize, count: usize, index: &dyn Fn(usize) -> usize| -> Vec<f32> {
-            (0..from.len())
-                .map(|i| {
-                    let at = index(i);
-                    let mut value = 0.0;
-                    for (k, tap) in kernel.iter().enumerate() {
-                        // Tap k takes the sample k - half steps on, if that is in the same row or
-                        // column.
-                        let there = at + k;
-                        if there >= half && there - half < count {
-                            value += tap
-                                * f64::from(from[i + there * stride - half * stride - at * stride]);
-                        }
-                    }
-                    (value / sum) as f32
-                })
-                .collect()
-        };
-    let along = pass(samples, 1, columns, &|i| i % columns);
-    pass(&along, columns, rows, &|i| i / columns)
+    let half = kernel.len() / 2;
+    (0..samples.len())
+        .map(|i| {
+            let at = i / stride % count;
+            let first = i - at * stride;
+            let mut value = 0.0;
+            for (k, tap) in kernel.iter().enumerate() {
+                // Tap k takes the sample k - half steps on, if that is in the same line.
+                let there = at + k;
+                if there >= half && there - half < count {
+                    value += tap * f64::from(samples[first + (there - half) * stride]);
+                }
+            }
+            (value / sum) as f32
+        })
+        .collect()
 }
 
 #[cfg(test)]
@@ -230,21 +234,24 @@ mod tests {
         }
     }
 
+    /// The middle of the brightness of what is drawn at a place.
+    fn middle_of_drawn(silhouette: &Silhouette, place: [f64; 2]) -> [f64; 2] {
+        let mut image = vec![0.0_f32; 60 * 50];
+        silhouette.draw(&mut image, 60, place, 1.0);
+        let (mut sum, mut moments) = (0.0, [0.0; 2]);
+        for (i, brightness) in image.into_iter().map(f64::from).enumerate() {
+            sum += brightness;
+            moments[0] += (i % 60) as f64 * brightness;
+            moments[1] += (i / 60) as f64 * brightness;
+        }
+        moments.map(|moment| moment / sum)
+    }
+
     #[test]
     fn what_is_drawn_lies_where_it_is_drawn() {
         let silhouette = Silhouette::new(25, 15);
-        let middle = |x: f64, y: f64| {
-            let mut image = vec![0.0_f32; 60 * 50];
-            silhouette.draw(&mut image, 60, [x, y], 1.0);
-            let sum: f64 = image.iter().map(|b| f64::from(*b)).sum();
-            let first = |of: &dyn Fn(usize) -> usize| {
-                image.iter().enumerate().map(|(i, b)| of(i) as f64 * f64::from(*b)).sum::<f64>()
-                    / sum
-            };
-            (first(&|i| i % 60), first(&|i| i / 60))
-        };
-        let (x0, y0) = middle(30.0, 25.0);
-        let (x1, y1) = middle(30.37, 24.2);
+        let [x0, y0] = middle_of_drawn(&silhouette, [30.0, 25.0]);
+        let [x1, y1] = middle_of_drawn(&silhouette, [30.37, 24.2]);
         assert!((x1 - x0 - 0.37).abs() < 1e-3 && (y1 - y0 + 0.8).abs() < 1e-3);
         // The silhouette is symmetric from left to right.
         assert!((x0 - 30.0).abs() < 1e-3);

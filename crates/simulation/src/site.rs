@@ -17,6 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Poisson, StandardNormal};
 
 use crate::circuit::{Airspace, Circuit};
+use crate::scene::in_range;
 use crate::{SceneError, TargetState};
 
 /// Track numbers per exposure: the bearings of an exposure are numbered from its sequence number
@@ -143,58 +144,50 @@ impl Site {
         self.check()?;
         let cameras =
             (0..self.cameras).map(|index| self.camera(index)).collect::<Result<_, _>>()?;
+        let flights = (0..self.targets).map(|target| self.flight(target)).collect();
+        Ok(SimulatedSite { description: self.clone(), cameras, flights })
+    }
+
+    fn flight(&self, target: usize) -> Circuit {
         let airspace = Airspace {
             half: Vector2::from(self.area_m) / 2.0,
             heights: self.heights_m,
             speeds: self.speeds_mps,
             turn: self.turn_rps,
         };
-        let flight = |target| {
-            let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
-            rng.set_stream(target as u64);
-            Circuit::random(&airspace, self.duration_s, &mut rng)
-        };
-        let flights = (0..self.targets).map(flight).collect();
-        Ok(SimulatedSite { description: self.clone(), cameras, flights })
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(target as u64);
+        Circuit::random(&airspace, self.duration_s, &mut rng)
     }
 
     fn check(&self) -> Result<(), SceneError> {
-        let in_range = |what: &str, value: f64, low: f64, high: f64, must| {
-            let is_in = (low..=high).contains(&value);
-            if is_in {
-                Ok(())
-            } else {
-                Err(SceneError::Number { what: what.to_owned(), value, must })
-            }
-        };
-        in_range("duration_s", self.duration_s, 1e-3, 1e5, "from 0.001 to 100000 s")?;
+        in_range("duration_s", self.duration_s, 1e-3..=1e5, "from 0.001 to 100000 s")?;
         for side in self.area_m {
-            in_range("area_m", side, 1.0, 1e5, "from 1 to 100000 m")?;
+            in_range("area_m", side, 1.0..=1e5, "from 1 to 100000 m")?;
         }
         let [low, high] = self.heights_m;
-        in_range("heights_m", low, 0.0, high, "from 0 to the greatest height")?;
-        in_range("heights_m", high, low, 1e4, "from the least height to 10000 m")?;
+        in_range("heights_m", low, 0.0..=high, "from 0 to the greatest height")?;
+        in_range("heights_m", high, low..=1e4, "from the least height to 10000 m")?;
         let [slow, fast] = self.speeds_mps;
-        in_range("speeds_mps", slow, 0.0, fast, "from 0 to the greatest speed")?;
-        in_range("speeds_mps", fast, slow, 1e3, "from the least speed to 1000 m/s")?;
-        in_range("turn_rps", self.turn_rps, 0.0, 3.0, "from 0 to 3 rad/s")?;
-        in_range("targets", self.targets as f64, 0.0, 1e5, "at most 100000")?;
-        in_range("cameras", self.cameras as f64, 1.0, 999.0, "from 1 to 999")?;
-        in_range("range_m", self.range_m, 1.0, 1e5, "from 1 to 100000 m")?;
-        in_range("rate_hz", self.rate_hz, 0.01, 1000.0, "from 0.01 to 1000 exposures a second")?;
-        in_range("detection_probability", self.detection_probability, 0.0, 1.0, "from 0 to 1")?;
-        in_range("clutter", self.clutter, 0.0, 1000.0, "from 0 to 1000 an exposure")?;
-        in_range("noise_rad", self.noise_rad, 1e-7, 0.1, "from 0.0000001 to 0.1 rad")
+        in_range("speeds_mps", slow, 0.0..=fast, "from 0 to the greatest speed")?;
+        in_range("speeds_mps", fast, slow..=1e3, "from the least speed to 1000 m/s")?;
+        in_range("turn_rps", self.turn_rps, 0.0..=3.0, "from 0 to 3 rad/s")?;
+        in_range("targets", self.targets as f64, 0.0..=1e5, "at most 100000")?;
+        in_range("cameras", self.cameras as f64, 1.0..=999.0, "from 1 to 999")?;
+        in_range("range_m", self.range_m, 1.0..=1e5, "from 1 to 100000 m")?;
+        in_range("rate_hz", self.rate_hz, 0.01..=1000.0, "from 0.01 to 1000 exposures a second")?;
+        in_range("detection_probability", self.detection_probability, 0.0..=1.0, "from 0 to 1")?;
+        in_range("clutter", self.clutter, 0.0..=1000.0, "from 0 to 1000 an exposure")?;
+        in_range("noise_rad", self.noise_rad, 1e-7..=0.1, "from 0.0000001 to 0.1 rad")
     }
 
     fn camera(&self, index: usize) -> Result<SiteCamera, SceneError> {
         let text = format!("cam{index}");
-        let number = || SceneError::Number {
+        let name: CameraName = text.parse().map_err(|_| SceneError::Number {
             what: "cameras".to_owned(),
             value: self.cameras as f64,
             must: "from 1 to 999",
-        };
-        let name: CameraName = text.parse().map_err(|_| number())?;
+        })?;
         let camera = self
             .pose(index)
             .and_then(|pose| Camera::new(self.intrinsics(), pose))
@@ -352,12 +345,18 @@ impl SimulatedSite {
         // For a mean of zero there is no Poisson distribution, and no clutter.
         let count =
             Poisson::new(self.description.clutter).map_or(0.0, |poisson| poisson.sample(rng));
+        (0..count as u64).filter_map(|_| self.random_direction(camera, rng)).collect()
+    }
+
+    /// Direction of a random pixel of a camera; `None` where the lens has none for it.
+    fn random_direction(
+        &self,
+        camera: &Camera,
+        rng: &mut ChaCha8Rng,
+    ) -> Option<Unit<Vector3<f64>>> {
         let [width, height] = self.description.size_px.map(|side| f64::from(side) - 1.0);
-        let direction = |_| {
-            let pixel = Pixel::new(rng.random_range(0.0..=width), rng.random_range(0.0..=height));
-            camera.model().direction(pixel).ok()
-        };
-        (0..count as u64).filter_map(direction).collect()
+        let pixel = Pixel::new(rng.random_range(0.0..=width), rng.random_range(0.0..=height));
+        camera.model().direction(pixel).ok()
     }
 
     fn track(&self, number: u64, camera: &Camera, direction: &Unit<Vector3<f64>>) -> BearingTrack {

@@ -39,11 +39,12 @@ pub(crate) fn sky(width: usize, height: usize, seed: u64) -> Vec<f32> {
 
 /// Brightness that falls from the lower edge to the upper one.
 fn gradient(width: usize, height: usize) -> Vec<f32> {
-    let level = |index: usize| {
-        let up = 1.0 - (index / width) as f32 / height as f32;
-        GRADIENT[0] + (GRADIENT[1] - GRADIENT[0]) * up
-    };
-    (0..width * height).map(level).collect()
+    (0..width * height).map(|index| level(1.0 - (index / width) as f32 / height as f32)).collect()
+}
+
+/// Brightness at a share of the height, from the lower edge.
+fn level(up: f32) -> f32 {
+    GRADIENT[0] + (GRADIENT[1] - GRADIENT[0]) * up
 }
 
 /// Size (pixels) and strength (levels) of an octave's clouds.
@@ -51,16 +52,17 @@ fn cell_and_strength(octave: u32) -> (usize, f32) {
     ((COARSEST >> octave).max(2), CLOUDS / (1 << octave) as f32)
 }
 
-/// Interpolates between the knots at the corners of a cell, by smoothstep weights `t^2 (3 - 2 t)`.
+/// Interpolates between the knots at the corners of a cell, by smoothstep weights.
 fn between(corner: impl Fn(usize, usize) -> f32, [x, y]: [usize; 2], cell: usize) -> f32 {
-    let smooth = |offset: usize| {
-        let t = offset as f32 / cell as f32;
-        t * t * (3.0 - 2.0 * t)
-    };
-    let (tx, ty) = (smooth(x), smooth(y));
+    let [tx, ty] = [x, y].map(|offset| smoothstep(offset as f32 / cell as f32));
     let upper = corner(0, 0) * (1.0 - tx) + corner(1, 0) * tx;
     let lower = corner(0, 1) * (1.0 - tx) + corner(1, 1) * tx;
     upper * (1.0 - ty) + lower * ty
+}
+
+/// From 0 to 1 as `t` does, level at both ends.
+fn smoothstep(t: f32) -> f32 {
+    t * t * (3.0 - 2.0 * t)
 }
 
 /// A periodic sky all around, of which a camera that turns sees a part.

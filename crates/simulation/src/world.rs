@@ -210,18 +210,21 @@ impl SimulatedCamera {
             return None;
         }
         let half = self.description.exposure_s / 2.0;
-        let place = |t: f64| {
-            let pixel = camera.project(target.path.state(t).0)?;
-            Some([pixel.x(), pixel.y()])
-        };
+
         let range = (target.path.state(t).0 - camera.pose().position()).norm();
         Some(RenderedTarget {
-            from: place(t - half)?,
-            to: place(t + half)?,
+            from: pixel_of(camera, target, t - half)?,
+            to: pixel_of(camera, target, t + half)?,
             span: target.span_m * self.description.focal_px / range,
             blur: self.description.blur_px,
         })
     }
+}
+
+/// Where a target is in a camera's image at a time, px.
+fn pixel_of(camera: &Camera, target: &SceneTarget, t: f64) -> Option<[f64; 2]> {
+    let pixel = camera.project(target.path.state(t).0)?;
+    Some([pixel.x(), pixel.y()])
 }
 
 #[cfg(test)]

@@ -34,16 +34,18 @@ const RADIUS: f32 = 20.0;
 impl Scene {
     /// Where the targets are in a frame.
     fn places(&self, frame: usize) -> Vec<[f32; 2]> {
+        (0..self.targets).map(|target| self.place(target, frame)).collect()
+    }
+
+    fn place(&self, target: usize, frame: usize) -> [f32; 2] {
         let turn = frame as f32 / ROUND as f32 * std::f32::consts::TAU;
+        // Each at another point of its path: if all went the same way, the camera would have
+        // turned.
+        let angle = turn + target as f32;
         let columns = self.squares[0];
-        let place = |k: usize| {
-            // Each at another point of its path: if all went the same way, the camera would have
-            // turned.
-            let angle = turn + k as f32;
-            let at = |square: usize| (square as f32 + 0.5) * SQUARE as f32;
-            [at(k % columns) + RADIUS * angle.cos(), at(k / columns) + RADIUS * angle.sin()]
-        };
-        (0..self.targets).map(place).collect()
+        let [x, y] =
+            [target % columns, target / columns].map(|at| (at as f32 + 0.5) * SQUARE as f32);
+        [x + RADIUS * angle.cos(), y + RADIUS * angle.sin()]
     }
 
     fn pictures(&self) -> Vec<Plane> {

@@ -170,13 +170,15 @@ fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
 
 /// Share of white noise's variance that is left when an image is sampled between its pixels.
 pub(crate) fn noise_kept(place: ImagePoint) -> f32 {
-    let axis = |at: f64| {
-        let f = at - at.floor();
-        // The squared weights of linear interpolation; the cubic one keeps about a third more.
-        let linear = f * f + (1.0 - f) * (1.0 - f);
-        (linear + 0.28 * (1.0 - linear)) as f32
-    };
-    axis(place.x) * axis(place.y)
+    noise_kept_along(place.x) * noise_kept_along(place.y)
+}
+
+/// The same of a row of pixels.
+fn noise_kept_along(at: f64) -> f32 {
+    let f = at - at.floor();
+    // The squared weights of linear interpolation; the cubic one keeps about a third more.
+    let linear = f * f + (1.0 - f) * (1.0 - f);
+    (linear + 0.28 * (1.0 - linear)) as f32
 }
 
 impl Appearance {

@@ -28,14 +28,16 @@ pub(crate) fn replace_invalid(plane: &mut Plane) {
 /// becomes an edge.
 const INWARDS: usize = 4;
 
+/// The columns (or rows) of a part of an image that lie inside it, of `all` columns.
+fn inside(corner: isize, side: usize, all: usize) -> Range<usize> {
+    let [first, end] = [0, all as isize].map(|edge| (edge - corner).clamp(0, side as isize));
+    first as usize..end as usize
+}
+
 /// The part of an image with its upper left corner at a place, which may lie outside the image.
 pub(crate) fn crop(image: &Plane, corner: [isize; 2], sides: [usize; 2], part: &mut Plane) {
     image.crop_into(corner[0], corner[1], sides[0], sides[1], part);
     replace_invalid(part);
-    let inside = |corner: isize, side: usize, all: usize| {
-        let at = |edge: isize| (edge - corner).clamp(0, side as isize) as usize;
-        at(0)..at(all as isize)
-    };
     let columns = inside(corner[0], sides[0], image.width());
     let rows = inside(corner[1], sides[1], image.height());
     if columns.is_empty()

@@ -68,14 +68,16 @@ impl ConnectedRegion {
     /// The box is centred on the middle of what stands out, which is the same for cameras on all
     /// sides; the middle of the corners is not.
     pub(crate) fn place(&self, corner: [isize; 2], least: [f64; 2]) -> PixelBox {
-        let Self { low, high, middle, .. } = *self;
-        let side = |i: usize| {
-            // Half side: the farther of the two corners from the middle.
-            let reach = (middle[i] - low[i] as f64).max(high[i] as f64 - middle[i]);
-            (2.0 * reach + 1.0).ceil().max(least[i])
-        };
-        let [x, y] = [0, 1].map(|i| corner[i] as f64 + middle[i]);
-        PixelBox::about(ImagePoint { x, y }, side(0), side(1))
+        let [x, y] = [0, 1].map(|i| corner[i] as f64 + self.middle[i]);
+        let [width, height] = [0, 1].map(|i| self.side(i).max(least[i]));
+        PixelBox::about(ImagePoint { x, y }, width, height)
+    }
+
+    /// Side of its box on an axis.
+    fn side(&self, i: usize) -> f64 {
+        // Half side: the farther of the two corners from the middle.
+        let reach = (self.middle[i] - self.low[i] as f64).max(self.high[i] as f64 - self.middle[i]);
+        (2.0 * reach + 1.0).ceil()
     }
 }
 
@@ -282,19 +284,12 @@ fn figure_within(
     // The mean of nine pixels has a third of their noise's standard deviation.
     let spread = (OF_MEDIAN * median(&mut off.samples().to_vec())).max(noise_sd / 3.0);
 
-    // A pixel inside the box is as likely to have been meant as any other there; outside, the
-    // probability falls off with the distance as a Gaussian.
-    let beside_box = |i: usize, index: usize| {
-        (((ranges[i].start + index) as f64 - at[i]).abs() - sides[i] / 2.0).max(0.0)
-    };
-    let likely = |[x, y]: [usize; 2]| {
-        (-0.5 * (beside_box(0, x).powi(2) + beside_box(1, y).powi(2)) / given_sd.powi(2)).exp()
-            as f32
-    };
     let level = |[x, y]: [usize; 2]| off.row(y)[x];
     let places = (0..off.height()).flat_map(|y| (0..off.width()).map(move |x| [x, y]));
     // The seed of the figure is the pixel with the largest product of prominence and probability.
-    let score = |place: [usize; 2]| level(place) * likely(place);
+    let score = |[x, y]: [usize; 2]| {
+        level([x, y]) * likely_meant(given, given_sd, [ranges[0].start + x, ranges[1].start + y])
+    };
     let seed = places.max_by(|one, other| score(*one).total_cmp(&score(*other)))?;
     let top = level(seed);
     if top < LEAST_TOP * spread {
@@ -307,4 +302,14 @@ fn figure_within(
     // box.
     let least = if ABOVE_GROUND * spread <= SHARE_OF_TOP * top { [1.0; 2] } else { sides };
     (region.weight >= f64::from(LEAST_SHARE * all)).then(|| region.place(corner, least))
+}
+
+/// Probability, up to a factor, that a pixel was meant by a given box: inside it as great as that
+/// of any other pixel there; outside, it falls off with the distance as a Gaussian.
+#[inline]
+fn likely_meant(given: PixelBox, given_sd: f64, [x, y]: [usize; 2]) -> f32 {
+    let centre = given.centre();
+    let beside_x = ((x as f64 - centre.x).abs() - given.width / 2.0).max(0.0);
+    let beside_y = ((y as f64 - centre.y).abs() - given.height / 2.0).max(0.0);
+    (-0.5 * (beside_x.powi(2) + beside_y.powi(2)) / given_sd.powi(2)).exp() as f32
 }

@@ -165,20 +165,15 @@ fn spread(from: &Plane, half: usize, [right, down]: [isize; 2], buffers: &mut Sp
     columns.clear();
     columns.resize(from.width(), 0.0);
     // Rows that are in the square of the first row, then those that come in and go out.
-    let rows_of = |y: isize| {
-        let middle = y.saturating_sub(down);
-        let first = middle.saturating_sub(half).clamp(0, height);
-        first..middle.saturating_add(half + 1).clamp(first, height)
-    };
     let mut inside = 0..0;
     for y in 0..height {
-        let next = rows_of(y);
-        let add = |columns: &mut Vec<f64>, row: isize, sign: f64| {
-            let row = from.row(row as usize).iter();
-            columns.iter_mut().zip(row).for_each(|(sum, cell)| *sum += sign * f64::from(*cell));
-        };
-        (inside.end.max(next.start)..next.end).for_each(|row| add(columns, row, 1.0));
-        (inside.start..next.start.min(inside.end)).for_each(|row| add(columns, row, -1.0));
+        let next = within(y.saturating_sub(down), half, height);
+        for row in inside.end.max(next.start)..next.end {
+            add_row(columns, from.row(row as usize), 1.0);
+        }
+        for row in inside.start..next.start.min(inside.end) {
+            add_row(columns, from.row(row as usize), -1.0);
+        }
         inside = next;
         before.clear();
         before.push(0.0);
@@ -201,12 +196,23 @@ fn spread(from: &Plane, half: usize, [right, down]: [isize; 2], buffers: &mut Sp
         }
         // ... and the others at clamped places.
         for x in (0..first).chain(end..width) {
-            let middle = x.saturating_sub(right);
-            let low = middle.saturating_sub(half).clamp(0, width);
-            let high = middle.saturating_add(half + 1).clamp(low, width);
-            out[x as usize] = mean(before[high as usize] - before[low as usize]);
+            let square = within(x.saturating_sub(right), half, width);
+            out[x as usize] = mean(before[square.end as usize] - before[square.start as usize]);
         }
     }
+}
+
+/// The cells of a line of `side` that lie within `half` of a place, which may be outside.
+#[inline]
+fn within(middle: isize, half: isize, side: isize) -> Range<isize> {
+    let first = middle.saturating_sub(half).clamp(0, side);
+    first..middle.saturating_add(half + 1).clamp(first, side)
+}
+
+/// Adds a row, times a sign, to sums down the columns.
+#[inline]
+fn add_row(columns: &mut [f64], row: &[f32], sign: f64) {
+    columns.iter_mut().zip(row).for_each(|(sum, cell)| *sum += sign * f64::from(*cell));
 }
 
 #[cfg(test)]

@@ -2,8 +2,8 @@
 //! times the prior by the motion, summed to mean, covariance, and the probability that it is not
 //! there at all.
 //!
-//! The sum has tens of thousands of terms, so it is computed by SIMD in single precision; weights are
-//! taken relative to the largest, so that no exponential overflows.
+//! The sum has tens of thousands of terms, so it is computed by SIMD in single precision; weights
+//! are taken relative to the largest, so that no exponential overflows.
 
 use crossfix_correlation::Plane;
 use pulp::{Arch, Simd, WithSimd};
@@ -212,13 +212,15 @@ fn without(whole: PosteriorPart, taken: PosteriorPart) -> PosteriorPart {
     if rest <= 1e-6 * whole.mass {
         return taken;
     }
-    let sums = |p: PosteriorPart| {
-        // Back from moments to sums: sum w x^2 = (var - 1/12 + mean^2) mass.
-        let second = [0, 1].map(|i| (p.variance[i] - 1.0 / 12.0 + p.mean[i] * p.mean[i]) * p.mass);
-        (p.mean.map(|m| m * p.mass), second)
-    };
-    let ((wf, ws), (tf, ts)) = (sums(whole), sums(taken));
+    let ([wf, ws], [tf, ts]) = (sums(whole), sums(taken));
     part(rest, [wf[0] - tf[0], wf[1] - tf[1]], [ws[0] - ts[0], ws[1] - ts[1]])
+}
+
+/// The sums of w x and of w x^2 per axis, back from the moments.
+fn sums(p: PosteriorPart) -> [[f64; 2]; 2] {
+    // sum w x^2 = (var - 1/12 + mean^2) mass.
+    let second = [0, 1].map(|i| (p.variance[i] - 1.0 / 12.0 + p.mean[i] * p.mean[i]) * p.mass);
+    [p.mean.map(|m| m * p.mass), second]
 }
 
 fn around(peak: [usize; 2], half: [usize; 2], sides: [usize; 2]) -> [std::ops::Range<usize>; 2] {

@@ -434,15 +434,17 @@ mod tests {
         }
     }
 
+    fn with_blob(mut image: Plane, column: usize) -> Plane {
+        for y in 100..106 {
+            image.row_mut(y)[column..column + 8].fill(250.0);
+        }
+        image
+    }
+
     #[test]
     fn what_has_changed_is_what_has_come_and_what_has_gone() {
         let mut scene = SceneMemory::default();
-        let with_blob = |mut image: Plane, column: usize| {
-            for y in 100..106 {
-                image.row_mut(y)[column..column + 8].fill(250.0);
-            }
-            image
-        };
+
         let mut change = Plane::default();
         assert!(!scene.change(&clouds([0.0; 2], 0.5, 1), &mut change));
         for frame in 0..40_usize {

@@ -205,43 +205,64 @@ impl ImageTracker {
             self.refused += 1;
             return &[];
         }
-        let since =
-            |last: Shot| time.seconds_since(last.time).clamp(SHORTEST_INTERVAL, LONGEST_INTERVAL);
-        let interval = self.last.map_or(LONGEST_INTERVAL, since);
-        if self.last.is_some_and(|last| time.seconds_since(last.time) > LONGEST_INTERVAL) {
+        let interval = self.pass_time(shot);
+        let scene_moved = self.register(image, interval);
+        self.follow(image, time, interval, scene_moved);
+        self.give_up(time);
+        self.tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
+        self.take_up_new(image, time, interval);
+        self.keep_snapshot(image, time);
+        self.keep_scene(image);
+        &self.tracks
+    }
+
+    /// Takes the time of an accepted image, and returns the interval since the last one, s.
+    fn pass_time(&mut self, shot: Shot) -> f64 {
+        let since = self.last.map(|last| shot.time.seconds_since(last.time));
+        if since.is_some_and(|since| since > LONGEST_INTERVAL) {
             // Nobody knows what the camera did meanwhile.
             self.forget_scene();
         }
         self.last = Some(shot);
+        since.map_or(LONGEST_INTERVAL, |since| since.clamp(SHORTEST_INTERVAL, LONGEST_INTERVAL))
+    }
 
-        self.tracks.clear();
-        let snapshot = self.snapshot.as_ref().map(|snapshot| &snapshot.picture);
-        let posterior = self.config.algorithm == Algorithm::Posterior;
+    /// Registers an image with the scene, and returns by how much everything has moved in it, px.
+    fn register(&mut self, image: &Plane, interval: f64) -> [f64; 2] {
         let before = self.scene.turned();
-        if posterior {
+        if self.config.algorithm == Algorithm::Posterior {
             self.scene.register(image, interval);
         }
         let after = self.scene.turned();
         // What is at p now was at p + turned at first: the same thing has moved by before - after.
-        let scene_moved = [0, 1].map(|i| before[i] - after[i]);
+        [0, 1].map(|i| before[i] - after[i])
+    }
+
+    /// The lost target whose turn it is to be searched for.
+    fn next_sought(&self) -> Option<ImageTrackId> {
+        // Where a candidate stands in for a target, something moves already: what a search finds
+        // beside that is more often the scene.
+        self.followed
+            .iter()
+            .filter(|f| f.target.is_searching() && f.stand_in.is_none() && !f.is_candidate())
+            // The one whose last search is longest ago; those never searched for come first.
+            .min_by_key(|f| f.searched)
+            .map(|f| f.id)
+    }
+
+    /// Follows all targets into an image, and makes its tracks.
+    fn follow(&mut self, image: &Plane, time: Timestamp, interval: f64, scene_moved: [f64; 2]) {
+        let turn = self.next_sought();
         let frame = FrameInput {
             image,
             interval,
-            snapshot,
+            snapshot: self.snapshot.as_ref().map(|snapshot| &snapshot.picture),
             scene: &self.scene,
             scene_moved,
             may_search: false,
             config: &self.config,
         };
-        // Where a candidate stands in for a target, something moves already: what a search finds
-        // beside that is more often the scene.
-        let turn = self
-            .followed
-            .iter()
-            .filter(|f| f.target.is_searching() && f.stand_in.is_none() && !f.is_candidate())
-            // The one whose last search is longest ago; those never searched for come first.
-            .min_by_key(|f| f.searched)
-            .map(|f| f.id);
+        self.tracks.clear();
         for followed in &mut self.followed {
             let frame = FrameInput { may_search: turn == Some(followed.id), ..frame };
             if frame.may_search {
@@ -258,18 +279,20 @@ impl ImageTracker {
             };
             self.tracks.push(describe(followed.id, &followed.target, phase, step));
         }
-        self.give_up(time);
-        self.tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
-        self.take_up_new(image, time, interval);
-        self.keep(image, time);
-        if posterior && let Some(number) = self.scene.keep(image) {
+    }
+
+    /// Keeps an image among the scene's pictures, where it is to be one; each target notes where it
+    /// is in that.
+    fn keep_scene(&mut self, image: &Plane) {
+        if self.config.algorithm == Algorithm::Posterior
+            && let Some(number) = self.scene.keep(image)
+        {
             for followed in &mut self.followed {
                 if let Follower::Posterior(target) = &mut followed.target {
                     target.identity.note_picture(&target.state, number);
                 }
             }
         }
-        &self.tracks
     }
 
     /// Whether an image is accepted: it follows the last one, or enough refused images agree with
@@ -305,7 +328,7 @@ impl ImageTracker {
 
     /// Keeps a snapshot for later losses, while every target is seen: from time to time, and when a
     /// target is new.
-    fn keep(&mut self, image: &Plane, time: Timestamp) {
+    fn keep_snapshot(&mut self, image: &Plane, time: Timestamp) {
         let all_seen = self
             .followed
             .iter()

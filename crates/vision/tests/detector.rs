@@ -305,23 +305,25 @@ fn told_that_it_looks_elsewhere_it_begins_anew() {
     assert!(before.is_some() && after > before, "{before:?} {after:?}: its numbers go on");
 }
 
+/// One of ten in a row: neighbours fly towards each other, past each other at a distance of 12 px,
+/// and on.
+fn in_rank(i: u32, time_s: f64) -> Spot {
+    let (column, row) = (f64::from(i % 10), f64::from(i / 10));
+    let speed = if i.is_multiple_of(2) { 40.0 } else { -40.0 };
+    let from = 40.0 + 60.0 * column;
+    Spot {
+        x: from + speed * (time_s - 0.8),
+        y: 60.0 + 80.0 * row + 12.0 * f64::from(i % 2),
+        spread: [2.5, 1.8],
+        brighter: 110.0,
+    }
+}
+
 #[test]
 fn fifty_at_once_are_found_and_keep_their_numbers() {
     let mut world = World::new(640, 480, 3.0, sky, 22);
     let spots = |time_s: f64| -> Vec<Spot> {
-        let spot = |i: u32| {
-            let (column, row) = (f64::from(i % 10), f64::from(i / 10));
-            // Neighbours fly towards each other, past each other at a distance of 12 px, and on.
-            let speed = if i.is_multiple_of(2) { 40.0 } else { -40.0 };
-            let from = 40.0 + 60.0 * column;
-            Spot {
-                x: from + speed * (time_s - 0.8),
-                y: 60.0 + 80.0 * row + 12.0 * f64::from(i % 2),
-                spread: [2.5, 1.8],
-                brighter: 110.0,
-            }
-        };
-        if time_s < 0.8 { Vec::new() } else { (0..50).map(spot).collect() }
+        if time_s < 0.8 { Vec::new() } else { (0..50).map(|i| in_rank(i, time_s)).collect() }
     };
     let mut numbers: Vec<Option<(u64, bool)>> = vec![None; 50];
     let mut last = 0;

@@ -130,14 +130,19 @@ fn drifting(frame: u32, target: Option<(f32, f32)>, noise: &mut impl FnMut() -> 
     })
 }
 
+/// Noise of three levels.
+fn noise(seed: u64) -> impl FnMut() -> f32 {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    move || {
+        let normal: f32 = StandardNormal.sample(&mut rng);
+        3.0 * normal
+    }
+}
+
 #[test]
 fn a_cloud_that_looks_like_the_target_is_not_followed_in_its_place() {
     for seed in 0..6 {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut noise = || -> f32 {
-            let normal: f32 = StandardNormal.sample(&mut rng);
-            3.0 * normal
-        };
+        let mut noise = noise(seed);
         let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
         tracker.take_up(PixelBox { x: 36.0, y: 116.0, width: 9.0, height: 9.0 });
         let (mut longest, mut running) = (0, 0);
@@ -163,11 +168,7 @@ fn a_cloud_that_looks_like_the_target_is_not_followed_in_its_place() {
 #[test]
 fn a_target_that_hovers_is_found_again_where_it_was() {
     for seed in 0..4 {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut noise = || -> f32 {
-            let normal: f32 = StandardNormal.sample(&mut rng);
-            3.0 * normal
-        };
+        let mut noise = noise(seed);
         let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
         tracker.take_up(PixelBox { x: 216.0, y: 76.0, width: 9.0, height: 9.0 });
         for frame in 0..240 {

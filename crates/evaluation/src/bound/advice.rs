@@ -156,17 +156,16 @@ pub fn advise(
     let known = known(cameras, volume, assumptions);
     let worst_m = volume.diagonal_m();
     let phase = cameras.len() as f64 / (cameras.len() + 1) as f64;
-    let candidate = |ring: f64, direction: u32| {
-        let place = on_ring(middle, ring * distance, height, direction);
-        let more = moved(like, place, middle)?;
-        let observer = TimedCamera::new(&more, phase, assumptions);
-        let score = score_with(&known, Some(&observer), worst_m);
-        Some(CandidatePlace { position_m: place.into(), score })
-    };
     let mut candidates: Vec<CandidatePlace> = RINGS
         .into_iter()
-        .flat_map(|ring| (0..DIRECTIONS).map(move |direction| (ring, direction)))
-        .filter_map(|(ring, direction)| candidate(ring, direction))
+        .flat_map(|ring| (0..DIRECTIONS).map(move |direction| (ring * distance, direction)))
+        .filter_map(|(radius_m, direction)| {
+            let place = on_ring(middle, radius_m, height, direction);
+            let more = moved(like, place, middle)?;
+            let observer = TimedCamera::new(&more, phase, assumptions);
+            let score = score_with(&known, Some(&observer), worst_m);
+            Some(CandidatePlace { position_m: place.into(), score })
+        })
         .collect();
     candidates.sort_by(|a, b| {
         let medians = a.score.median_sd_m.total_cmp(&b.score.median_sd_m);

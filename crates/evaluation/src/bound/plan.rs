@@ -237,14 +237,17 @@ pub fn smallest_target(
     point: Point3<f64>,
     least_px: f64,
 ) -> Option<f64> {
-    let size = |planned: &PlannedCamera| {
-        let lens = planned.camera.model().intrinsics();
-        let range = (point - planned.camera.pose().position()).norm();
-        planned.camera.sees(point).then(|| least_px * range / (lens.fx * lens.fy).sqrt())
-    };
-    let mut sizes: Vec<f64> = cameras.iter().filter_map(size).collect();
+    let mut sizes: Vec<f64> =
+        cameras.iter().filter_map(|planned| size_of(least_px, &planned.camera, point)).collect();
     sizes.sort_by(f64::total_cmp);
     sizes.get(1).copied()
+}
+
+/// What spans so many pixels at a point, m; `None` if the camera does not have it in its image.
+fn size_of(pixels: f64, camera: &Camera, point: Point3<f64>) -> Option<f64> {
+    let lens = camera.model().intrinsics();
+    let range = (point - camera.pose().position()).norm();
+    camera.sees(point).then(|| pixels * range / (lens.fx * lens.fy).sqrt())
 }
 
 #[cfg(test)]

@@ -25,6 +25,12 @@ pub struct Summary {
     pub degenerate: Option<f64>,
 }
 
+fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values
+}
+
 /// The value that a share of the sorted values does not exceed.
 fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
     let index = (share * sorted.len() as f64).ceil() as usize;
@@ -37,13 +43,8 @@ impl Summary {
         let cells: Vec<&Cell> = cells.into_iter().collect();
         let fixes: Vec<&Accuracy> =
             cells.iter().filter_map(|cell| cell.accuracy.as_ref()).collect();
-        let sorted = |value: fn(&Accuracy) -> f64| {
-            let mut values: Vec<f64> = fixes.iter().map(|fix| value(fix)).collect();
-            values.sort_by(f64::total_cmp);
-            values
-        };
-        let positions = sorted(|fix| fix.position_sd_m);
-        let velocities = sorted(|fix| fix.velocity_sd_mps);
+        let positions = sorted(fixes.iter().map(|fix| fix.position_sd_m));
+        let velocities = sorted(fixes.iter().map(|fix| fix.velocity_sd_mps));
         let degenerate = fixes.iter().filter(|fix| fix.is_degenerate()).count();
         let heights: f64 = cells.iter().map(|Cell { centre_m: [_, _, up], .. }| up).sum();
         let share = |part: usize, whole: usize| part as f64 / whole as f64;
@@ -98,13 +99,20 @@ pub fn contributions(
     assumptions: &Assumptions,
     cells: &[Cell],
 ) -> Vec<Contribution> {
-    let of = |(index, camera): (usize, &PlannedCamera)| {
-        let without = without(index, cameras, volume, assumptions);
-        let seen = cells.iter().filter(|cell| cell.cameras.contains(&index)).count();
-        let sees = seen as f64 / cells.len().max(1) as f64;
-        Contribution::of(camera, assumptions, sees, without)
-    };
-    cameras.iter().enumerate().map(of).collect()
+    cameras
+        .iter()
+        .enumerate()
+        .map(|(index, camera)| {
+            let without = without(index, cameras, volume, assumptions);
+            Contribution::of(camera, assumptions, share_seen(index, cells), without)
+        })
+        .collect()
+}
+
+/// Share of the cubes that a camera sees.
+fn share_seen(camera: usize, cells: &[Cell]) -> f64 {
+    let seen = cells.iter().filter(|cell| cell.cameras.contains(&camera)).count();
+    seen as f64 / cells.len().max(1) as f64
 }
 
 fn without(

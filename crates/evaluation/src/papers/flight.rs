@@ -61,6 +61,12 @@ pub(crate) struct Canvas {
     painted: Option<[std::ops::Range<usize>; 2]>,
 }
 
+/// The columns (or rows) of the picture within `reach` of a place.
+fn pixels_about(at: f64, reach: usize) -> std::ops::Range<usize> {
+    let middle = at.round().clamp(0.0, SIDE as f64 - 1.0) as usize;
+    middle.saturating_sub(reach)..(middle + reach).min(SIDE)
+}
+
 impl Canvas {
     /// A picture for targets of given sides.
     pub(crate) fn new(sides: [usize; 2]) -> Self {
@@ -84,11 +90,7 @@ impl Canvas {
                 self.image.row_mut(row)[columns.clone()].fill(0.0);
             }
         }
-        let range = |at: f64, reach: usize| {
-            let middle = at.round().clamp(0.0, SIDE as f64 - 1.0) as usize;
-            middle.saturating_sub(reach)..(middle + reach).min(SIDE)
-        };
-        let area = [range(at[0], self.reach[0]), range(at[1], self.reach[1])];
+        let area = [0, 1].map(|axis| pixels_about(at[axis], self.reach[axis]));
         match stamp {
             Some(Stamp::Drawn(silhouette)) => {
                 silhouette.draw(self.image.samples_mut(), SIDE, at, strength);

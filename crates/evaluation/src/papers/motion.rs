@@ -77,12 +77,14 @@ fn outcomes(
         outcomes.drain(..flight.skipped.min(outcomes.len()));
         Some(outcomes)
     });
-    let kept = |run: &Vec<TrackErrors>| {
-        run.iter().all(|o| {
-            o.prediction[0].abs() <= sides[0] as f64 && o.prediction[1].abs() <= sides[1] as f64
-        })
-    };
-    runs.into_iter().flatten().filter(kept).collect()
+    runs.into_iter().flatten().filter(|run| is_kept(run, sides)).collect()
+}
+
+/// Whether a run never predicted the target further off than its size.
+fn is_kept(run: &[TrackErrors], sides: [usize; 2]) -> bool {
+    run.iter().all(|o| {
+        o.prediction[0].abs() <= sides[0] as f64 && o.prediction[1].abs() <= sides[1] as f64
+    })
 }
 
 /// The velocity at a frame, px/s: with constant acceleration over each tact, v+ = 2 dx / T - v.

@@ -21,23 +21,21 @@ const CHEAP: usize = 20;
 const ERRATA_BOUNDS: [[f64; 2]; 4] =
     [[0.195, 0.155], [0.255, 0.197], [0.281, 0.241], [0.502, 0.392]];
 
+/// Half of the distance over which slopes are taken, px: below the eighth of a pixel of the
+/// silhouette's own grid, so that half of it gives nearly the same.
+const SLOPE_STEP: f64 = 0.05;
+
 /// The Cramer-Rao bound for noise of SD 1: `sqrt(diag J^-1)`, J the sum of the gradient's outer
 /// products, here with contrast and brightness known.
 fn bound(silhouette: &Silhouette) -> [f64; 2] {
-    /// Half of the distance over which slopes are taken, px: below the eighth of a pixel of the
-    /// silhouette's own grid, so that half of it gives nearly the same.
-    const STEP: f64 = 0.05;
     let [width, height] = silhouette.sides().map(|side| side as i32 / 2 + 5);
     let half = silhouette.sides().map(|side| (side as f64 - 1.0) / 2.0);
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
     for row in -height..=height {
         for column in -width..=width {
-            let (x, y) = (f64::from(column) + half[0].fract(), f64::from(row) + half[1].fract());
-            let slope = |dx: f64, dy: f64| {
-                let ahead = f64::from(silhouette.pixel(x + dx, y + dy));
-                (ahead - f64::from(silhouette.pixel(x - dx, y - dy))) / (2.0 * STEP)
-            };
-            let (gx, gy) = (slope(STEP, 0.0), slope(0.0, STEP));
+            let at = [f64::from(column) + half[0].fract(), f64::from(row) + half[1].fract()];
+            let [gx, gy] =
+                [[SLOPE_STEP, 0.0], [0.0, SLOPE_STEP]].map(|step| slope(silhouette, at, step));
             xx += gx * gx;
             xy += gx * gy;
             yy += gy * gy;
@@ -46,6 +44,12 @@ fn bound(silhouette: &Silhouette) -> [f64; 2] {
     let determinant = xx * yy - xy * xy;
     // Diagonal of the inverse of the 2 x 2 matrix.
     [(yy / determinant).sqrt(), (xx / determinant).sqrt()]
+}
+
+/// Slope of a silhouette at a place along a step of length `SLOPE_STEP`, 1/px.
+fn slope(silhouette: &Silhouette, [x, y]: [f64; 2], [dx, dy]: [f64; 2]) -> f64 {
+    let ahead = f64::from(silhouette.pixel(x + dx, y + dy));
+    (ahead - f64::from(silhouette.pixel(x - dx, y - dy))) / (2.0 * SLOPE_STEP)
 }
 
 /// Width of the low-pass for a noisy reference, px: the more noise, the wider.
@@ -121,54 +125,84 @@ fn fits(
     })
 }
 
-/// Fig. 5 with clean and noisy reference, and the bias over the phases of a pixel.
-pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
-    let (mut accuracy, mut ratios, mut bias) = (Vec::new(), Vec::new(), Vec::new());
-    for (size, errata) in TEMPLATE_SIZES.into_iter().zip(ERRATA_BOUNDS) {
-        let silhouette = Silhouette::new(size[0], size[1]);
-        let name = format!("{}x{}", size[0], size[1]);
-        let bound = bound(&silhouette);
+/// The axes' names.
+const AXES: [&str; 2] = ["x", "y"];
+
+/// Rows of the three tables.
+#[derive(Default)]
+struct PositioningRows {
+    accuracy: Vec<TableRow>,
+    ratios: Vec<TableRow>,
+    bias: Vec<TableRow>,
+}
+
+impl PositioningRows {
+    /// Adds the rows of a silhouette.
+    fn add(&mut self, options: ValidationOptions, silhouette: &Silhouette, errata: [f64; 2]) {
+        let (sides, bound) = (silhouette.sides(), bound(silhouette));
         for sigma_n in [0.1, 0.2, 0.3] {
             for noisy in [false, true] {
-                let errors = fits(options, &silhouette, sigma_n, noisy);
-                for (axis, label) in ["x", "y"].into_iter().enumerate() {
-                    let of: Vec<f64> = errors.iter().map(|e| e[axis]).collect();
-                    let (deviation, standard_error) = root_mean_square(&of);
+                let errors = fits(options, silhouette, sigma_n, noisy);
+                for axis in 0..2 {
+                    let errors: Vec<f64> = errors.iter().map(|e| e[axis]).collect();
                     let kind = if noisy { "noisy reference" } else { "clean reference" };
-                    let series = format!("{name} {label}, {kind}");
-                    // Herasymenko 2021, eq. 16: 2 sigma over the side. The paper claims it to be
-                    // below a pixel.
-                    let normalised = 2.0 / size[axis] as f64;
-                    accuracy.push(TableRow::new(
-                        &series,
-                        sigma_n,
-                        (deviation * normalised, standard_error * normalised),
-                    ));
-                    // Two noisy pictures determine their offset root 2 less well than one noisy and
-                    // one clean.
-                    let best =
-                        bound[axis] * sigma_n * if noisy { std::f64::consts::SQRT_2 } else { 1.0 };
-                    let asked = Limit::AtMost(if noisy { 1.35 } else { 1.10 });
-                    ratios.push(
-                        TableRow::new(series, sigma_n, (deviation / best, standard_error / best))
-                            .limit(asked),
-                    );
+                    let series = format!("{}, {kind}", name(silhouette, axis));
+                    let figure = root_mean_square(&errors);
+                    self.accuracy.push(accuracy(&series, sigma_n, figure, sides[axis]));
+                    self.ratios.push(over_bound(series, sigma_n, figure, bound[axis], noisy));
                 }
             }
         }
         for axis in 0..2 {
-            let label = ["x", "y"][axis];
+            let name = name(silhouette, axis);
             let near = Limit::Near { value: errata[axis], tolerance: 0.02 * errata[axis] };
-            ratios.push(
-                TableRow::new(format!("bound {name} {label}"), 1.0, (bound[axis], 0.0)).limit(near),
-            );
-            let worst = worst_bias(&silhouette, axis);
-            bias.push(
-                TableRow::new(format!("{name} {label}"), 0.0, (worst, 0.0))
-                    .limit(Limit::AtMost(0.01)),
-            );
+            self.ratios
+                .push(TableRow::new(format!("bound {name}"), 1.0, (bound[axis], 0.0)).limit(near));
+            let worst = worst_bias(silhouette, axis);
+            self.bias.push(TableRow::new(name, 0.0, (worst, 0.0)).limit(Limit::AtMost(0.01)));
         }
     }
+}
+
+/// Name of an axis of a silhouette.
+fn name(silhouette: &Silhouette, axis: usize) -> String {
+    let [width, height] = silhouette.sides();
+    format!("{width}x{height} {}", AXES[axis])
+}
+
+/// Row of the normalised error, 2 sigma over the side (Herasymenko 2021, eq. 16). The paper claims
+/// it to be below a pixel.
+fn accuracy(
+    series: &str,
+    sigma_n: f64,
+    (deviation, standard_error): (f64, f64),
+    side: usize,
+) -> TableRow {
+    let normalised = 2.0 / side as f64;
+    TableRow::new(series, sigma_n, (deviation * normalised, standard_error * normalised))
+}
+
+/// Row of the error over the bound, which is that for noise of SD 1.
+fn over_bound(
+    series: String,
+    sigma_n: f64,
+    (deviation, standard_error): (f64, f64),
+    bound: f64,
+    noisy: bool,
+) -> TableRow {
+    // Two noisy pictures determine their offset root 2 less well than one noisy and one clean.
+    let best = bound * sigma_n * if noisy { std::f64::consts::SQRT_2 } else { 1.0 };
+    let asked = Limit::AtMost(if noisy { 1.35 } else { 1.10 });
+    TableRow::new(series, sigma_n, (deviation / best, standard_error / best)).limit(asked)
+}
+
+/// Fig. 5 with clean and noisy reference, and the bias over the phases of a pixel.
+pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
+    let mut rows = PositioningRows::default();
+    for (size, errata) in TEMPLATE_SIZES.into_iter().zip(ERRATA_BOUNDS) {
+        rows.add(options, &Silhouette::new(size[0], size[1]), errata);
+    }
+    let PositioningRows { accuracy, ratios, bias } = rows;
     let table = |name, title: &str, x, y, rows| Table { name, title: title.to_owned(), x, y, rows };
     vec![
         table(

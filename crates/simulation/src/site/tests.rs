@@ -69,15 +69,17 @@ fn clutter_is_poisson_and_within_the_image() {
     );
 }
 
+/// All messages of a site.
+fn bytes(site: &Site) -> Vec<Vec<u8>> {
+    let simulated = site.build().unwrap();
+    let calibrations: Vec<Vec<u8>> = simulated.calibrations().iter().map(Payload::encode).collect();
+    calibrations.into_iter().chain(simulated.bearings().map(|e| e.frame.encode())).collect()
+}
+
 #[test]
 fn the_same_seed_gives_the_same_bytes_in_order_of_time() {
     let site = Site { duration_s: 1.0, cameras: 7, layout: Layout::Grid, ..Site::default() };
-    let bytes = |site: &Site| -> Vec<Vec<u8>> {
-        let simulated = site.build().unwrap();
-        let calibrations: Vec<Vec<u8>> =
-            simulated.calibrations().iter().map(Payload::encode).collect();
-        calibrations.into_iter().chain(simulated.bearings().map(|e| e.frame.encode())).collect()
-    };
+
     assert_eq!(bytes(&site), bytes(&site));
     assert_ne!(bytes(&site), bytes(&Site { seed: 2, ..site.clone() }));
     let times: Vec<i64> =
@@ -103,12 +105,15 @@ fn every_place_of_a_grid_is_seen_by_several_cameras() {
 
 #[test]
 fn numbers_that_make_no_sense_are_named() {
-    let refused = |site: Site, key: &str| match site.build() {
-        Err(SceneError::Number { what, .. }) => assert_eq!(what, key),
-        other => panic!("{other:?}"),
-    };
-    refused(Site { detection_probability: f64::NAN, ..Site::default() }, "detection_probability");
-    refused(Site { heights_m: [50.0, 40.0], ..Site::default() }, "heights_m");
-    refused(Site { cameras: 0, ..Site::default() }, "cameras");
+    for (site, key) in [
+        (Site { detection_probability: f64::NAN, ..Site::default() }, "detection_probability"),
+        (Site { heights_m: [50.0, 40.0], ..Site::default() }, "heights_m"),
+        (Site { cameras: 0, ..Site::default() }, "cameras"),
+    ] {
+        match site.build() {
+            Err(SceneError::Number { what, .. }) => assert_eq!(what, key),
+            other => panic!("{other:?}"),
+        }
+    }
     assert!(Site { focal_px: 0.0, ..Site::default() }.build().is_err());
 }

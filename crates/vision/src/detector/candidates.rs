@@ -6,77 +6,120 @@ use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
 use super::plots::Plot;
 use crate::ImagePoint;
 
-/// Probability that a candidate's plot lies in its gate. With 0.99 one plot in a hundred misses its
-/// candidate, and begins another.
-const IN_GATE: f64 = 0.999;
-/// Probability that a target makes a plot in an image. With 0.9 what blinks in noise is dropped,
-/// with 0.6 chains of noise live long.
-const MAKES_PLOT: f64 = 0.8;
-/// Standard deviation of a target's velocity beforehand, px/s: one of 400 px/s is not lost by it.
-/// With half of it the gate of the second plot ends at about 220 px/s and the plots' own errors.
-const VELOCITY_SD_PX: f64 = 120.0;
-/// Standard deviation of its white acceleration, px/s^2: a turn of 2 g at 100 m, with a lens of
-/// 1000 px per radian, and half as much again. With half of it such a turn, of 196 px/s^2, exceeds
-/// one standard deviation, and its plots count for less.
-const ACCELERATION_SD_PX: f64 = 300.0;
-/// Largest ratio between the scales of one thing's plots: as its parts and its shadow come and go,
-/// the next scale on either side stands out more. With 5 the plots of a bird and of its flock count
-/// as one thing's.
-const SCALES: f64 = 2.5;
-/// Most that one plot tells (logarithm of a likelihood ratio): an empty corner of the clutter map
-/// is not known to be empty. With half of it a target in an empty sky needs up to twice as many
-/// plots.
-const MOST_OF_PLOT: f64 = 4.0;
-/// Most that the plots of a candidate that keeps to its place tell together (log likelihood ratio):
-/// what comes and goes in one place, as a branch in the wind, makes as many plots as a target. With
-/// half of it there are 0.4 and 1.5 false tracks per minute (thermal, visible) instead of 1.1 and
-/// 3.1, but what a shaken camera sees in noise is found in 76 % of the images instead of 89; with
-/// twice as much there are 13 and 49.
-const MOST_IN_PLACE: f64 = 8.0;
-/// ... and this much more where noise does not last: there, what lasts is less likely to be noise.
-/// With half of it a target that keeps to its place in a sensor's noise must stand out by 2 nats
-/// more.
-const MOST_IN_NOISE: f64 = 4.0;
-/// This many of its cells further a candidate is in another place, over another part of the scene,
-/// ...
-const PLACE_CELLS: f64 = 6.0;
-/// ... of which at most this many are counted: what jumps from branch to branch has gone far too.
-/// With half of the first a swing of three cells is another part already; with half of the second
-/// what goes far gains by its first 30 cells only.
-const MOST_PLACES: f64 = 10.0;
-/// Decay length of the scene's own changes, which fall off exponentially with their size, in units
-/// of the texture: compressed video has more large ones than a normal distribution. With twice as
-/// much 89.0 % of the thermal frames have their target instead of 90.6, and there are 0.4 and 1.9
-/// false tracks per minute.
-const TAIL: f64 = 1.5;
-/// Constant of the density of a target's strength, nats: strengths from one to two hundred, uniform
-/// in their logarithm, give `ln ln 200` = 1.7; the rest is a margin, chosen on scenes without
-/// targets. With half of it chance passes for a target up to 3.5 times (`e^1.25`) as often.
-const STANDING: f64 = 2.5;
-/// Most that the strength tells (log likelihood ratio). With half of it the strongest target needs
-/// two plots more, of `MOST_OF_PLOT` each.
-const MOST_OF_STANDING: f64 = 10.0;
-/// Least variance of the noise in a mean over many images, spreads^2: plots are the part of the
-/// noise that stands out. With half of it chance plots in a clear sky stand 1.4 times as high.
-const LEAST_NOISE: f64 = 0.5;
-/// A candidate whose log likelihood ratio by motion is less than this is dropped, ...
-const LEAST_LOG_RATIO: f64 = -2.0;
-/// ... and so is one without a plot for this long, s. With half of the first a new candidate is
-/// dropped at its first image without a plot (`ln 0.2` = -1.6), with half of the second any after 6
-/// such images at 30 per second.
-const UNSEEN_S: f64 = 0.4;
-/// Most candidates, those with the greatest log likelihood ratios: as many as two images' plots.
-/// With half of it one image's chance plots fill the list, and faint targets fall off its end.
-const MOST: usize = 400;
-/// Side of a cell of the clutter map, px. With half of it a cell has a quarter of the plots, and
-/// its clutter is known half as well.
-const MAP_CELL_PX: f64 = 32.0;
-/// Averaging time of the clutter, s: with 1 a target's own first plots make it improbable, with 10
-/// the leaves of a gust are taken for targets.
-const CLUTTER_S: f64 = 3.0;
-/// Least clutter of a cell of the map, plots per image: one in ten thousand. With less, whatever
-/// comes into an empty sky is found with its second plot.
-const LEAST_CLUTTER: f64 = 1e-4;
+/// What is expected of a target and its plots.
+struct TargetModel {
+    /// Probability that a target makes a plot in an image. With 0.9 what blinks in noise is
+    /// dropped, with 0.6 chains of noise live long.
+    makes_plot: f64,
+    /// Probability that a candidate's plot lies in its gate. With 0.99 one plot in a hundred misses
+    /// its candidate, and begins another.
+    in_gate: f64,
+    /// Standard deviation of a target's velocity beforehand, px/s: one of 400 px/s is not lost by
+    /// it. With half of it the gate of the second plot ends at about 220 px/s and the plots' own
+    /// errors.
+    velocity_sd_px: f64,
+    /// Standard deviation of its white acceleration, px/s^2: a turn of 2 g at 100 m, with a lens of
+    /// 1000 px per radian, and half as much again. With half of it such a turn, of 196 px/s^2,
+    /// exceeds one standard deviation, and its plots count for less.
+    acceleration_sd_px: f64,
+    /// Largest ratio between the scales of one thing's plots: as its parts and its shadow come and
+    /// go, the next scale on either side stands out more. With 5 the plots of a bird and of its
+    /// flock count as one thing's.
+    most_scales: f64,
+}
+
+const TARGET: TargetModel = TargetModel {
+    makes_plot: 0.8,
+    in_gate: 0.999,
+    velocity_sd_px: 120.0,
+    acceleration_sd_px: 300.0,
+    most_scales: 2.5,
+};
+
+/// How much the places of a candidate's plots may tell, as log likelihood ratios.
+struct MotionEvidence {
+    /// Most that one plot tells: an empty corner of the clutter map is not known to be empty. With
+    /// half of it a target in an empty sky needs up to twice as many plots.
+    most_of_plot: f64,
+    /// Most that the plots of a candidate that keeps to its place tell together: what comes and
+    /// goes in one place, as a branch in the wind, makes as many plots as a target. With half of it
+    /// there are 0.4 and 1.5 false tracks per minute (thermal, visible) instead of 1.1 and 3.1, but
+    /// what a shaken camera sees in noise is found in 76 % of the images instead of 89; with twice
+    /// as much there are 13 and 49.
+    most_in_place: f64,
+    /// This much more where noise does not last: there, what lasts is less likely to be noise. With
+    /// half of it a target that keeps to its place in a sensor's noise must stand out by 2 nats
+    /// more.
+    more_in_noise: f64,
+    /// This many of its cells further a candidate is in another place, over another part of the
+    /// scene. With half of it a swing of three cells is another part already.
+    cells_of_place: f64,
+    /// Most such places that are counted: what jumps from branch to branch has gone far too. With
+    /// half of it what goes far gains by its first 30 cells only.
+    most_places: f64,
+}
+
+const MOTION: MotionEvidence = MotionEvidence {
+    most_of_plot: 4.0,
+    most_in_place: 8.0,
+    more_in_noise: 4.0,
+    cells_of_place: 6.0,
+    most_places: 10.0,
+};
+
+/// How much the strength of a candidate's plots tells.
+struct StrengthEvidence {
+    /// Decay length of the scene's own changes, which fall off exponentially with their size, in
+    /// units of the texture: compressed video has more large ones than a normal distribution. With
+    /// twice as much 89.0 % of the thermal frames have their target instead of 90.6, and there are
+    /// 0.4 and 1.9 false tracks per minute.
+    tail: f64,
+    /// Constant of the density of a target's strength, nats: strengths from one to two hundred,
+    /// uniform in their logarithm, give `ln ln 200` = 1.7; the rest is a margin, chosen on scenes
+    /// without targets. With half of it chance passes for a target up to 3.5 times (`e^1.25`) as
+    /// often.
+    density_constant: f64,
+    /// Most that the strength tells, nats. With half of it the strongest target needs two plots
+    /// more, of [`MotionEvidence::most_of_plot`] each.
+    most: f64,
+    /// Least variance of the noise in a mean over many images, spreads^2: plots are the part of the
+    /// noise that stands out. With half of it chance plots in a clear sky stand 1.4 times as high.
+    least_noise: f64,
+}
+
+const STRENGTH: StrengthEvidence =
+    StrengthEvidence { tail: 1.5, density_constant: 2.5, most: 10.0, least_noise: 0.5 };
+
+/// Which candidates are kept.
+struct Kept {
+    /// Log likelihood ratio by motion below which one is dropped. With half of it a new candidate
+    /// is dropped at its first image without a plot (`ln 0.2` = -1.6).
+    least_log_ratio: f64,
+    /// One without a plot for this long, s, is dropped too. With half of it any is after 6 such
+    /// images at 30 per second.
+    unseen_s: f64,
+    /// Most candidates, those with the greatest log likelihood ratios: as many as two images'
+    /// plots. With half of it one image's chance plots fill the list, and faint targets fall off
+    /// its end.
+    most: usize,
+}
+
+const KEPT: Kept = Kept { least_log_ratio: -2.0, unseen_s: 0.4, most: 400 };
+
+/// How clutter is counted, in cells of the image.
+struct ClutterModel {
+    /// Side of a cell, px. With half of it a cell has a quarter of the plots, and its clutter is
+    /// known half as well.
+    cell_px: f64,
+    /// Averaging time, s: with 1 a target's own first plots make it improbable, with 10 the leaves
+    /// of a gust are taken for targets.
+    mean_s: f64,
+    /// Least clutter of a cell, plots per image: one in ten thousand. With less, whatever comes
+    /// into an empty sky is found with its second plot.
+    least: f64,
+}
+
+const CLUTTER: ClutterModel = ClutterModel { cell_px: 32.0, mean_s: 3.0, least: 1e-4 };
 
 /// A track of plots that may be a target.
 ///
@@ -99,12 +142,11 @@ pub(super) struct Candidate {
 
 impl Candidate {
     fn new(plot: Plot, place: [f64; 2]) -> Self {
-        let start = |position| {
-            let first = AxisMeasurement { position, variance: plot.variance() };
-            AxisFilter::start_at_rest(first, VELOCITY_SD_PX, ACCELERATION_SD_PX)
-        };
+        let first = place.map(|position| AxisMeasurement { position, variance: plot.variance() });
+        let TargetModel { velocity_sd_px, acceleration_sd_px, .. } = TARGET;
         Self {
-            axes: place.map(start),
+            axes: first
+                .map(|first| AxisFilter::start_at_rest(first, velocity_sd_px, acceleration_sd_px)),
             plot,
             motion_log_ratio: 0.0,
             mean_excess: f64::from(plot.excess),
@@ -118,7 +160,7 @@ impl Candidate {
     /// Number of parts of the scene that it has been over.
     fn parts(&self) -> f64 {
         // n = 1 + distance gone / size of a part, the second term bounded.
-        1.0 + (self.gone_px / (PLACE_CELLS * self.plot.cell)).min(MOST_PLACES)
+        1.0 + (self.gone_px / (MOTION.cells_of_place * self.plot.cell)).min(MOTION.most_places)
     }
 
     /// Log-likelihood ratio of a target against what the scene and the noise make.
@@ -131,13 +173,15 @@ impl Candidate {
         let looks = f64::from(self.plots) * (1.0 - persistence) / (1.0 + persistence);
         // Variance of the mean excess, in spreads^2: noise averages out over the looks, texture
         // over the parts of the scene.
-        let noise = (1.0 / looks.max(1.0)).max(LEAST_NOISE);
+        let noise = (1.0 / looks.max(1.0)).max(STRENGTH.least_noise);
         let texture = f64::from(self.plot.texture).powi(2) / self.parts();
-        // s / TAIL - ln s is least at s = TAIL, and would rise again below it.
-        let standing = (self.mean_excess / (texture + noise).sqrt()).max(TAIL);
+        // s / tail - ln s is least at s = tail, and would rise again below it.
+        let standing = (self.mean_excess / (texture + noise).sqrt()).max(STRENGTH.tail);
         // Strength s: a density uniform in ln s against the exponential tail of the scene's
         // changes.
-        self.motion_log_ratio + (standing / TAIL - standing.ln() - STANDING).min(MOST_OF_STANDING)
+        self.motion_log_ratio
+            + (standing / STRENGTH.tail - standing.ln() - STRENGTH.density_constant)
+                .min(STRENGTH.most)
     }
 
     /// Squared Mahalanobis distance of a plot's place, and the determinant of the innovation's
@@ -156,7 +200,7 @@ impl Candidate {
 
     fn may_make(&self, plot: &Plot) -> bool {
         let scales = self.plot.cell.max(plot.cell) / self.plot.cell.min(plot.cell);
-        self.plot.is_brighter == plot.is_brighter && scales <= SCALES
+        self.plot.is_brighter == plot.is_brighter && scales <= TARGET.most_scales
     }
 
     /// Updates with a plot; `chance` is the density of clutter, 1/px^2.
@@ -168,11 +212,13 @@ impl Candidate {
         self.gone_px = self.gone_px.max(off[0].hypot(off[1]));
         // ln (P_D N(innovation; 0, S) / clutter), with P_D the probability of a plot.
         let there = -0.5 * distance - (std::f64::consts::TAU * determinant.sqrt()).ln();
-        let told = (MAKES_PLOT.ln() + there - chance.ln()).min(MOST_OF_PLOT);
+        let told = (TARGET.makes_plot.ln() + there - chance.ln()).min(MOTION.most_of_plot);
         // The bound grows by 1 with each further part of the scene, and is higher where noise does
         // not last.
         self.motion_log_ratio = (self.motion_log_ratio + told).min(
-            MOST_IN_PLACE + MOST_IN_NOISE * (1.0 - f64::from(plot.persistence)) + self.parts()
+            MOTION.most_in_place
+                + MOTION.more_in_noise * (1.0 - f64::from(plot.persistence))
+                + self.parts()
                 - 1.0,
         );
         self.plots += 1;
@@ -196,18 +242,18 @@ struct Clutter {
 
 impl Clutter {
     fn cell(&self, place: ImagePoint) -> usize {
-        let [x, y] = [place.x, place.y].map(|at| (at / MAP_CELL_PX).max(0.0) as usize);
+        let [x, y] = [place.x, place.y].map(|at| (at / CLUTTER.cell_px).max(0.0) as usize);
         (x.min(self.columns - 1) + y * self.columns).min(self.means.len() - 1)
     }
 
     /// Density of clutter at a place, 1/px^2.
     fn density(&self, place: ImagePoint) -> f64 {
-        self.means[self.cell(place)] / (MAP_CELL_PX * MAP_CELL_PX)
+        self.means[self.cell(place)] / (CLUTTER.cell_px * CLUTTER.cell_px)
     }
 
     fn fit(&mut self, [width, height]: [usize; 2]) {
         let [columns, rows] =
-            [width, height].map(|side| (side as f64 / MAP_CELL_PX).ceil() as usize);
+            [width, height].map(|side| (side as f64 / CLUTTER.cell_px).ceil() as usize);
         if (self.columns, self.means.len()) != (columns, columns * rows) {
             // As long as nothing is known, one plot per image over the whole map.
             let mean = 1.0 / (columns * rows) as f64;
@@ -223,9 +269,9 @@ impl Clutter {
     }
 
     fn learn(&mut self, interval: f64) {
-        let share = 1.0 - (-interval / CLUTTER_S).exp();
+        let share = 1.0 - (-interval / CLUTTER.mean_s).exp();
         for (mean, count) in self.means.iter_mut().zip(&self.counts) {
-            *mean = (*mean + share * (count - *mean)).max(LEAST_CLUTTER);
+            *mean = (*mean + share * (count - *mean)).max(CLUTTER.least);
         }
         let a_minute = self.counts.iter().sum::<f64>() * 60.0 / interval;
         self.a_minute += share * (a_minute - self.a_minute);
@@ -258,7 +304,7 @@ impl Candidates {
     ) {
         self.clutter.fit(sides);
         let in_scene = |plot: &Plot| [plot.place.x + turned[0], plot.place.y + turned[1]];
-        let gate = Gate::with_probability(IN_GATE);
+        let gate = Gate::with_probability(TARGET.in_gate);
         let mut is_free = vec![true; plots.len()];
         // The likeliest candidates choose first: the list is sorted.
         for candidate in &mut self.list {
@@ -284,13 +330,13 @@ impl Candidates {
                 }
                 None => {
                     // ln (1 - P_D).
-                    candidate.motion_log_ratio += (1.0 - MAKES_PLOT).ln();
+                    candidate.motion_log_ratio += (1.0 - TARGET.makes_plot).ln();
                     candidate.unseen_s += interval;
                 }
             }
         }
         self.list.retain(|candidate| {
-            candidate.motion_log_ratio > LEAST_LOG_RATIO && candidate.unseen_s < UNSEEN_S
+            candidate.motion_log_ratio > KEPT.least_log_ratio && candidate.unseen_s < KEPT.unseen_s
         });
         for (plot, _) in plots.iter().zip(is_free).filter(|(_, is_free)| *is_free) {
             let cell = self.clutter.cell(plot.place);
@@ -299,7 +345,7 @@ impl Candidates {
         }
         self.clutter.learn(interval);
         self.list.sort_by(|one, other| other.log_ratio().total_cmp(&one.log_ratio()));
-        self.list.truncate(MOST);
+        self.list.truncate(KEPT.most);
     }
 
     /// Removes the candidates that pass, and returns them.

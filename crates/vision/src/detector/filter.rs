@@ -7,6 +7,8 @@ use pulp::Arch;
 /// three. With half of it a target of three cells is 36 % of its own surroundings instead of 11,
 /// and stands out by that much less.
 pub(super) const SURROUNDINGS: usize = 4;
+/// Side of the surroundings, cells.
+const SIDE: usize = 2 * SURROUNDINGS + 1;
 
 /// Means of two by two; an odd last row or column is left out.
 pub(super) fn halve(from: &Plane, to: &mut Plane) {
@@ -75,21 +77,22 @@ pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
 
 /// Means of the surroundings along a row, from the sums down the columns.
 fn means_along(sums: &[f32], means: &mut [f32]) {
-    const SIDE: usize = 2 * SURROUNDINGS + 1;
     let share = 1.0 / (SIDE * SIDE) as f32;
-    let last = sums.len() - 1;
-    let clamped = |x: usize| {
-        let places = x..x + SIDE;
-        share * places.map(|x| sums[x.saturating_sub(SURROUNDINGS).min(last)]).sum::<f32>()
-    };
     let inner = sums.len().saturating_sub(SIDE - 1);
     // At both ends the border column is repeated; between them the windows are whole.
     for x in (0..SURROUNDINGS.min(sums.len())).chain(SURROUNDINGS + inner..sums.len()) {
-        means[x] = clamped(x);
+        means[x] = share * sum_about(sums, x);
     }
     for (mean, window) in means.iter_mut().skip(SURROUNDINGS).zip(sums.windows(SIDE)) {
         *mean = share * window.iter().sum::<f32>();
     }
+}
+
+/// The sum over the surroundings of a column; beyond the ends the last columns are repeated.
+#[inline]
+fn sum_about(sums: &[f32], x: usize) -> f32 {
+    let last = sums.len() - 1;
+    (x..x + SIDE).map(|x| sums[x.saturating_sub(SURROUNDINGS).min(last)]).sum()
 }
 
 /// The plane sampled at each cell plus `by`, which is less than a cell on either axis.
@@ -131,11 +134,11 @@ pub(super) fn moved(from: &Plane, [right, down]: [isize; 2], to: &mut Plane) {
 pub(super) fn between(plane: &Plane, [x, y]: [f64; 2]) -> f32 {
     let (left, top) = (x.floor(), y.floor());
     let [right, down] = [x - left, y - top].map(|rest| rest as f32);
-    let row = |y: isize| {
+    let [above, below] = [0, 1].map(|k| {
+        let y = top as isize + k;
         let [a, b] = [0, 1].map(|k| plane.clamped(left as isize + k, y));
         a + right * (b - a)
-    };
-    let [above, below] = [0, 1].map(|k| row(top as isize + k));
+    });
     above + down * (below - above)
 }
 

@@ -123,19 +123,7 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
     {
         return None;
     }
-    let refined = [0, 1].map(|axis| {
-        let near = |step: isize| {
-            let mut place = top.map(|at| at as isize);
-            place[axis] += step;
-            standing(level.now.clamped(place[0], place[1]))
-        };
-        // Place between the cells: the top of a parabola through three of them.
-        let [before, here, after] = [-1, 0, 1].map(near);
-        let bend = before - 2.0 * here + after;
-        let off = if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-0.5, 0.5) } else { 0.0 };
-        top[axis] as f64 + f64::from(off)
-    });
-    let [x, y] = level.place_of(refined);
+    let [x, y] = level.place_of([0, 1].map(|axis| refined(&level.now, top, axis, sign)));
     // The measured texture contains the noise: one spread squared is subtracted.
     let texture = (level.texture_about(top).powi(2) - 1.0).max(0.0).sqrt();
     Some(Plot {
@@ -148,6 +136,19 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
         texture,
         persistence: level.persistence,
     })
+}
+
+/// Where a plane, times a sign, has its top on an axis, between the cells: the top of a parabola
+/// through three of them.
+fn refined(plane: &Plane, top: [usize; 2], axis: usize, sign: f32) -> f64 {
+    let [before, here, after] = [-1, 0, 1].map(|step| {
+        let mut place = top.map(|at| at as isize);
+        place[axis] += step;
+        sign * plane.clamped(place[0], place[1])
+    });
+    let bend = before - 2.0 * here + after;
+    let off = if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-0.5, 0.5) } else { 0.0 };
+    top[axis] as f64 + f64::from(off)
 }
 
 /// Where a plane is greatest, up to one cell from a place.

@@ -77,10 +77,13 @@ impl ImmConfig {
     }
 }
 
+/// One model's state of eight pixels, in `PARTS` numbers.
+type EightStates = [Lanes; PARTS];
+
 /// The filters of eight pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct EightPixels {
-    states: [[Lanes; PARTS]; MODELS],
+    states: [EightStates; MODELS],
     probabilities: [Lanes; MODELS],
 }
 
@@ -171,77 +174,113 @@ impl EightPixels {
         measured: Lanes,
         variance: Lanes,
     ) -> Lanes {
-        let leave = (1.0 - stay) / (MODELS - 1) as f32;
-        let (before, states) = (self.probabilities, self.states);
+        let before = *self;
         let zero = Lanes::splat(0.0);
         let mut likelihoods = [zero; MODELS];
         let mut exponents = [zero; MODELS];
         for l in 0..MODELS {
-            // (10): the probability of each model before, given that l holds now.
-            let [mut prior, mut mixed] = [zero, zero];
-            let mut weights = [zero; MODELS];
-            let mut rate = zero;
-            for m in 0..MODELS {
-                weights[m] = before[m] * if m == l { stay } else { leave };
-                prior = prior + weights[m];
-            }
-            let share = Lanes::splat(1.0) / prior;
-            // (11): mixed state and covariance.
-            for m in 0..MODELS {
-                weights[m] = weights[m] * share;
-                mixed = mixed + weights[m] * states[m][0];
-                rate = rate + weights[m] * states[m][1];
-            }
-            // P = sum w_m (P_m + d d'), d = x_m - x: the spread of the means is part of it.
-            let [mut p11, mut p12, mut p22] = [zero; 3];
-            for m in 0..MODELS {
-                let (d0, d1) = (states[m][0] - mixed, states[m][1] - rate);
-                p11 = p11 + weights[m] * (states[m][2] + d0 * d0);
-                p12 = p12 + weights[m] * (states[m][3] + d0 * d1);
-                p22 = p22 + weights[m] * (states[m][4] + d1 * d1);
-            }
-            // (12): extrapolation, x = B x and P = B P B' + M.
-            let PixelModel { rate: step, keep, noise } = models[l];
-            let brightness = mixed + rate * step;
-            let slope = rate * keep;
-            let cross = p12 + p22 * step;
-            p11 = p11 + (p12 + cross) * step + Lanes::splat(noise[0]);
-            p12 = cross * keep + Lanes::splat(noise[1]);
-            p22 = p22 * (keep * keep) + Lanes::splat(noise[2]);
-            // (13): the measurement, erratum: `f` is the measurement and `R_f` its variance.
-            let innovation = measured - brightness;
-            let inverse = Lanes::splat(1.0) / (p11 + variance);
-            let (k1, k2) = (p11 * inverse, p12 * inverse);
-            self.states[l] = [
-                brightness + k1 * innovation,
-                slope + k2 * innovation,
-                k1 * variance,
-                k2 * variance,
-                p22 - k2 * p12,
-            ];
+            let (prior, mixed) = before.mixed(l, stay);
+            let predicted = models[l].time_update(mixed);
+            let inverse = Lanes::splat(1.0) / (predicted[2] + variance);
+            let innovation = measured - predicted[0];
+            self.states[l] = measurement_update(predicted, innovation, inverse, variance);
             // (14)-(15): the likelihood N(innovation; 0, P11 + R) up to a common factor, its
             // exponent kept apart.
             exponents[l] = innovation * innovation * inverse * -0.5;
             likelihoods[l] = prior * inverse.sqrt();
         }
+        self.weigh(likelihoods, exponents);
+        // (16): the estimate that does not depend on a hypothesis.
+        let mut filtered = zero;
+        for (probability, state) in self.probabilities.iter().zip(&self.states) {
+            filtered = filtered + *probability * state[0];
+        }
+        filtered
+    }
+
+    /// The states mixed for a model `l`, and its probability before the measurement: equations
+    /// (10) and (11).
+    #[inline(always)]
+    fn mixed(&self, l: usize, stay: f32) -> (Lanes, EightStates) {
+        let leave = (1.0 - stay) / (MODELS - 1) as f32;
+        let (zero, states) = (Lanes::splat(0.0), &self.states);
+        // (10): the probability of each model before, given that l holds now.
+        let mut weights = self.probabilities;
+        let mut prior = zero;
+        for (m, weight) in weights.iter_mut().enumerate() {
+            *weight = *weight * if m == l { stay } else { leave };
+            prior = prior + *weight;
+        }
+        let share = Lanes::splat(1.0) / prior;
+        // (11): mixed state and covariance.
+        let [mut brightness, mut rate] = [zero; 2];
+        for m in 0..MODELS {
+            weights[m] = weights[m] * share;
+            brightness = brightness + weights[m] * states[m][0];
+            rate = rate + weights[m] * states[m][1];
+        }
+        // P = sum w_m (P_m + d d'), d = x_m - x: the spread of the means is part of it.
+        let [mut p11, mut p12, mut p22] = [zero; 3];
+        for m in 0..MODELS {
+            let (d0, d1) = (states[m][0] - brightness, states[m][1] - rate);
+            p11 = p11 + weights[m] * (states[m][2] + d0 * d0);
+            p12 = p12 + weights[m] * (states[m][3] + d0 * d1);
+            p22 = p22 + weights[m] * (states[m][4] + d1 * d1);
+        }
+        (prior, [brightness, rate, p11, p12, p22])
+    }
+
+    /// Sets the models' probabilities from their likelihoods, the exponents of which are apart.
+    #[inline(always)]
+    fn weigh(&mut self, mut likelihoods: [Lanes; MODELS], exponents: [Lanes; MODELS]) {
         // The largest exponent is taken out of all, so that not all of them underflow.
         let largest = exponents[0].max(exponents[1]).max(exponents[2]);
         let least = Lanes::splat(f32::MIN_POSITIVE);
-        let mut total = zero;
+        let mut total = Lanes::splat(0.0);
         for (likelihood, exponent) in likelihoods.iter_mut().zip(exponents) {
             *likelihood = (*likelihood * (exponent - largest).exp()).max(least);
             total = total + *likelihood;
         }
         let share = Lanes::splat(1.0) / total;
-        let mut filtered = zero;
-        let models = self.probabilities.iter_mut().zip(&self.states).zip(likelihoods);
-        for ((probability, state), likelihood) in models {
+        for (probability, likelihood) in self.probabilities.iter_mut().zip(likelihoods) {
             *probability = (likelihood * share).max(Lanes::splat(LEAST_PROBABILITY));
-            // (16): the estimate that does not depend on a hypothesis.
-            filtered = filtered + *probability * state[0];
         }
-        filtered
     }
+}
+
+impl PixelModel {
+    /// Equation (12): extrapolation, x = B x and P = B P B' + M.
+    #[inline(always)]
+    fn time_update(&self, [brightness, rate, p11, p12, p22]: EightStates) -> EightStates {
+        let Self { rate: step, keep, noise } = *self;
+        let cross = p12 + p22 * step;
+        [
+            brightness + rate * step,
+            rate * keep,
+            p11 + (p12 + cross) * step + Lanes::splat(noise[0]),
+            cross * keep + Lanes::splat(noise[1]),
+            p22 * (keep * keep) + Lanes::splat(noise[2]),
+        ]
+    }
+}
+
+/// Equation (13), with the innovation and the inverse of its variance (erratum: `f` is the
+/// measurement and `R_f` its variance).
+#[inline(always)]
+fn measurement_update(
+    [brightness, slope, p11, p12, p22]: EightStates,
+    innovation: Lanes,
+    inverse: Lanes,
+    variance: Lanes,
+) -> EightStates {
+    let (k1, k2) = (p11 * inverse, p12 * inverse);
+    [
+        brightness + k1 * innovation,
+        slope + k2 * innovation,
+        k1 * variance,
+        k2 * variance,
+        p22 - k2 * p12,
+    ]
 }
 
 #[cfg(test)]

@@ -272,6 +272,14 @@ fn figures(
     ]
 }
 
+/// How far our probability, with its standard error, may be from the reference's.
+fn probability_tolerance(reference: f64, standard_error: f64) -> f64 {
+    // A probability of 0 or 1 in the reference has no estimated variance: up to a hundredth is
+    // then allowed.
+    let variance = reference * (1.0 - reference) / REFERENCE_RUNS as f64 + standard_error.powi(2);
+    (3.0 * variance.sqrt()).max(3.0 / REFERENCE_RUNS as f64) + 0.005
+}
+
 /// Tables 1 and 2 with both readings.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let mut rows: [Vec<TableRow>; 4] = Default::default();
@@ -287,15 +295,11 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                     rows[quantity].push(TableRow::new(&series, cell.delays[1], figure));
                     continue;
                 };
-                let probability = quantity == 2;
-                let reference_samples = REFERENCE_RUNS * if probability { 1 } else { cell.targets };
-                let mut tolerance = reference_tolerance(figure.1, samples, reference_samples, 0.01);
-                if probability {
-                    // A probability of 0 or 1 in the reference has no estimated variance: up to a
-                    // hundredth is then allowed.
-                    let variance = value * (1.0 - value) / REFERENCE_RUNS as f64 + figure.1.powi(2);
-                    tolerance = (3.0 * variance.sqrt()).max(3.0 / REFERENCE_RUNS as f64) + 0.005;
-                }
+                let tolerance = if quantity == 2 {
+                    probability_tolerance(value, figure.1)
+                } else {
+                    reference_tolerance(figure.1, samples, REFERENCE_RUNS * cell.targets, 0.01)
+                };
                 rows[quantity].push(
                     TableRow::new(&series, cell.delays[1], figure)
                         .paper(cell.paper[quantity])

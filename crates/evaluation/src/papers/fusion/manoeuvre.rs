@@ -102,22 +102,15 @@ enum FilterChoice {
 struct FilterResult {
     /// Squared errors per axis, m^2, means over the judged frames.
     squares: [f64; 3],
-    /// Frames with alarms.
-    alarms: Vec<usize>,
+    /// Of each turn, as of [`delays`].
+    delays: Vec<Option<f64>>,
 }
 
 impl FilterChoice {
     fn follow(&self, flight: &TurningFlight, deviation: f64) -> FilterResult {
         let (places, alarms) = match self {
             Self::Measurement => (flight.measured.clone(), Vec::new()),
-            Self::Imm(models) => {
-                let (mut imm, spread) = (Imm::new(start(), models), spread(deviation));
-                let step = |z: &Point3<f64>| {
-                    imm.update(STEP, models, |state| state.position_updated(*z, &spread));
-                    imm.combined().position()
-                };
-                (flight.measured.iter().map(step).collect(), Vec::new())
-            }
+            Self::Imm(models) => (by_models(flight, deviation, models), Vec::new()),
             Self::Kalman(density) => by_kalman(flight, deviation, *density, None),
             Self::Nis(density) => {
                 let detector = NormalisedInnovation::new(2, 1e-4);
@@ -133,7 +126,7 @@ impl FilterChoice {
                 *square += (found[axis] - truth[axis]).powi(2) / count;
             }
         }
-        FilterResult { squares, alarms }
+        FilterResult { squares, delays: delays(flight, &alarms) }
     }
 
     fn name(&self) -> String {
@@ -200,6 +193,17 @@ fn by_smoothed_residual(
         places.push(state.position());
     }
     (places, alarms)
+}
+
+/// Places of interacting multiple models.
+fn by_models(flight: &TurningFlight, deviation: f64, models: &MotionModels) -> Vec<Point3<f64>> {
+    let (mut imm, spread) = (Imm::new(start(), models), spread(deviation));
+    let mut places = Vec::new();
+    for z in &flight.measured {
+        imm.update(STEP, models, |state| state.position_updated(*z, &spread));
+        places.push(imm.combined().position());
+    }
+    places
 }
 
 fn nis(state: &KinematicState, measured: Point3<f64>, spread: &Matrix3<f64>) -> Option<f64> {
@@ -280,76 +284,113 @@ const REFERENCES: [[Option<f64>; 2]; 8] = [
 fn delays(flight: &TurningFlight, alarms: &[usize]) -> Vec<Option<f64>> {
     let ends = flight.turns.iter().skip(1).copied().chain([flight.places.len()]);
     let turns = flight.turns.iter().zip(ends);
-    let delay = |(&turn, end): (&usize, usize)| {
-        let alarm = alarms.iter().find(|&&alarm| alarm > turn && alarm <= end)?;
-        Some((alarm - turn) as f64)
-    };
-    turns.map(delay).collect()
+    turns
+        .map(|(&turn, end)| {
+            let alarm = alarms.iter().find(|&&alarm| alarm > turn && alarm <= end)?;
+            Some((alarm - turn) as f64)
+        })
+        .collect()
 }
 
-/// The rows of the tables for one noise.
-fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<TableRow>; 3] {
-    let deviation = DEVIATIONS[noise_number];
-    let methods = methods(deviation, options.seed);
-    let results = runs::all(options.runs, |run| {
-        let flight = TurningFlight::new(deviation, &mut Noise::new(options.seed, run));
-        let of = |method: &FilterChoice| {
-            let followed = method.follow(&flight, deviation);
-            let delays = delays(&flight, &followed.alarms);
-            (followed.squares, delays)
-        };
-        methods.iter().map(of).collect::<Vec<_>>()
-    });
-    let all_axes = |method: usize| -> Vec<f64> {
-        results.iter().map(|run| run[method].0.iter().sum::<f64>() / 3.0).collect()
-    };
-    let [mut errors, mut ratios, mut alarms] = [vec![], vec![], vec![]];
-    for (index, method) in methods.iter().enumerate() {
-        for (axis, label) in ["x", "y", "z"].into_iter().enumerate() {
-            let roots: Vec<f64> = results.iter().map(|run| run[index].0[axis].sqrt()).collect();
-            let row = TableRow::new(
-                format!("{}, {label}", method.name()),
-                deviation,
-                root_mean_square(&roots),
-            );
-            let reference = REFERENCES[index][noise_number].filter(|_| axis == 0);
-            errors.push(TableRow { reference, ..row });
-        }
-        if matches!(method, FilterChoice::Smoothed(_)) {
-            let over = |other: usize| root_ratio(&all_axes(index), &all_axes(other));
-            let row = |other: &str, figure| {
-                TableRow::new(format!("{} over Kalman, {other}", method.name()), deviation, figure)
-            };
-            // "Much better" than a filter without a model of manoeuvres: in the reference twice or
-            // five times as good. Compared with a filter tuned for them it loses (errata).
-            ratios.push(row("low noise", over(LOW)).limit(Limit::AtMost(0.5)));
-            ratios.push(row("tuned", over(TUNED)).limit(Limit::AtLeast(1.0)));
-        }
-        if matches!(method, FilterChoice::Smoothed(_) | FilterChoice::Nis(_)) {
-            let delays: Vec<Option<f64>> =
-                results.iter().flat_map(|run| run[index].1.clone()).collect();
-            let seen: Vec<f64> = delays.iter().flatten().copied().collect();
-            let row = |what: &str, figure| {
-                TableRow::new(format!("{}: {what}", method.name()), deviation, figure)
-            };
-            if !seen.is_empty() {
-                let reference = delay_of_reference(method).filter(|_| noise_number == 0);
-                alarms.push(TableRow { reference, ..row("frames to the alarm", mean(&seen)) });
-            }
-            alarms.push(row("share of turns seen", share(delays.iter().map(Option::is_some))));
-        }
+/// All methods on the flights at one noise.
+struct NoiseCase {
+    /// Its number in `DEVIATIONS`.
+    number: usize,
+    methods: Vec<FilterChoice>,
+    /// Of each flight, the methods' results in their order.
+    results: Vec<Vec<FilterResult>>,
+}
+
+impl NoiseCase {
+    fn new(options: ValidationOptions, number: usize) -> Self {
+        let deviation = DEVIATIONS[number];
+        let methods = methods(deviation, options.seed);
+        let results = runs::all(options.runs, |run| {
+            let flight = TurningFlight::new(deviation, &mut Noise::new(options.seed, run));
+            methods.iter().map(|method| method.follow(&flight, deviation)).collect()
+        });
+        Self { number, methods, results }
     }
-    let between = |one: usize, other: usize, limit| {
-        let name = format!("{} over {}", methods[one].name(), methods[other].name());
-        TableRow::new(name, deviation, root_ratio(&all_axes(one), &all_axes(other))).limit(limit)
-    };
-    // Which is best: the detector of innovations where turns stand out of the noise, else the
-    // interacting models.
-    let turns_stand_out = SPEED * STEP > deviation;
-    let worse_or_better = if turns_stand_out { Limit::AtMost(1.0) } else { Limit::AtLeast(1.0) };
-    ratios.push(between(NIS, MODELS, worse_or_better));
-    ratios.push(between(MODELS, TUNED, Limit::AtMost(1.0)));
-    [errors, ratios, alarms]
+
+    fn row(&self, series: String, figure: (f64, f64)) -> TableRow {
+        TableRow::new(series, DEVIATIONS[self.number], figure)
+    }
+
+    /// RMS errors on each axis.
+    fn errors(&self) -> Vec<TableRow> {
+        let mut rows = Vec::new();
+        for (index, method) in self.methods.iter().enumerate() {
+            for (axis, label) in ["x", "y", "z"].into_iter().enumerate() {
+                let roots: Vec<f64> =
+                    self.results.iter().map(|run| run[index].squares[axis].sqrt()).collect();
+                let series = format!("{}, {label}", method.name());
+                let reference = REFERENCES[index][self.number].filter(|_| axis == 0);
+                rows.push(TableRow { reference, ..self.row(series, root_mean_square(&roots)) });
+            }
+        }
+        rows
+    }
+
+    /// Ratios between methods over all axes.
+    fn ratios(&self) -> Vec<TableRow> {
+        let mut rows = Vec::new();
+        for (index, method) in self.methods.iter().enumerate() {
+            if matches!(method, FilterChoice::Smoothed(_)) {
+                let name = method.name();
+                // "Much better" than a filter without a model of manoeuvres: in the reference twice
+                // or five times as good. Compared with a filter tuned for them it loses (errata).
+                let (low, tuned) = (self.ratio(index, LOW), self.ratio(index, TUNED));
+                let series = format!("{name} over Kalman, low noise");
+                rows.push(self.row(series, low).limit(Limit::AtMost(0.5)));
+                let series = format!("{name} over Kalman, tuned");
+                rows.push(self.row(series, tuned).limit(Limit::AtLeast(1.0)));
+            }
+        }
+        // Which is best: the detector of innovations where turns stand out of the noise, else the
+        // interacting models.
+        let turns_stand_out = SPEED * STEP > DEVIATIONS[self.number];
+        let worse_or_better =
+            if turns_stand_out { Limit::AtMost(1.0) } else { Limit::AtLeast(1.0) };
+        rows.push(self.one_over_other(NIS, MODELS).limit(worse_or_better));
+        rows.push(self.one_over_other(MODELS, TUNED).limit(Limit::AtMost(1.0)));
+        rows
+    }
+
+    fn one_over_other(&self, one: usize, other: usize) -> TableRow {
+        let series = format!("{} over {}", self.methods[one].name(), self.methods[other].name());
+        self.row(series, self.ratio(one, other))
+    }
+
+    /// Ratio of two methods' RMS errors over all axes.
+    fn ratio(&self, one: usize, other: usize) -> (f64, f64) {
+        root_ratio(&self.squares(one), &self.squares(other))
+    }
+
+    /// Squared errors of a method, per flight, means over the axes.
+    fn squares(&self, method: usize) -> Vec<f64> {
+        self.results.iter().map(|run| run[method].squares.iter().sum::<f64>() / 3.0).collect()
+    }
+
+    /// Delays of the alarms, and how many turns have one.
+    fn alarms(&self) -> Vec<TableRow> {
+        let mut rows = Vec::new();
+        for (index, method) in self.methods.iter().enumerate() {
+            if !matches!(method, FilterChoice::Smoothed(_) | FilterChoice::Nis(_)) {
+                continue;
+            }
+            let name = method.name();
+            let delays = self.results.iter().flat_map(|run| &run[index].delays);
+            let seen: Vec<f64> = delays.clone().flatten().copied().collect();
+            if !seen.is_empty() {
+                let reference = delay_of_reference(method).filter(|_| self.number == 0);
+                let row = self.row(format!("{name}: frames to the alarm"), mean(&seen));
+                rows.push(TableRow { reference, ..row });
+            }
+            let seen = share(delays.map(Option::is_some));
+            rows.push(self.row(format!("{name}: share of turns seen"), seen));
+        }
+        rows
+    }
 }
 
 /// Frames from a turn to the alarm in the reference, at little noise; it has 2.0 to 2.2 for the
@@ -364,13 +405,13 @@ fn delay_of_reference(method: &FilterChoice) -> Option<f64> {
 
 /// Fig. 11, and the comparisons that it is meant to show.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
-    let mut tables: [Vec<TableRow>; 3] = Default::default();
-    for noise_number in 0..DEVIATIONS.len() {
-        for (table, rows) in tables.iter_mut().zip(rows(options, noise_number)) {
-            table.extend(rows);
-        }
+    let (mut errors, mut ratios, mut alarms) = (Vec::new(), Vec::new(), Vec::new());
+    for number in 0..DEVIATIONS.len() {
+        let case = NoiseCase::new(options, number);
+        errors.extend(case.errors());
+        ratios.extend(case.ratios());
+        alarms.extend(case.alarms());
     }
-    let [errors, ratios, alarms] = tables;
     vec![
         table(
             "manoeuvre-error",
