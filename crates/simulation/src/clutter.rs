@@ -7,7 +7,7 @@ use nalgebra::{Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::FlightPath;
-use crate::render::RenderedShape;
+use crate::render::{Piece, RenderedThing};
 
 /// A thing of a scene that is no target. Metres, world; brightness in 8-bit levels.
 ///
@@ -104,42 +104,43 @@ impl SceneClutter {
         numbers && (0.0..=255.0).contains(level)
     }
 
-    /// How it appears in a camera's image at a time (s from the scene's start), each shape with its
-    /// distance from the camera, m. What is behind the camera is left out.
-    pub(crate) fn shapes(&self, camera: &Camera, t: f64) -> Vec<(f64, RenderedShape)> {
-        match self {
+    /// How it appears in a camera's image at a time (s from the scene's start), with its mean
+    /// distance from the camera, m; `None` if no part of it is before the camera.
+    pub(crate) fn appearance(&self, camera: &Camera, t: f64) -> Option<(f64, RenderedThing)> {
+        let (seen, pieces, level) = match self {
             Self::Mast { foot_m, height_m, width_m, level } => {
                 let foot = Point3::from(*foot_m);
                 let at = |share: f64| foot + Vector3::z() * (share * height_m);
-                pieces(camera, at, *width_m, *level)
+                let seen = seen_along(camera, at);
+                let pieces = strips(&seen, *width_m);
+                (seen, pieces, level)
             }
             Self::Wire { from_m, to_m, sag_m, width_m, level } => {
-                let ends = [Point3::from(*from_m), Point3::from(*to_m)];
-                pieces(camera, |share| wire_point(ends, *sag_m, share), *width_m, *level)
+                let (from, to) = (Point3::from(*from_m), Point3::from(*to_m));
+                // z -= 4 sag s (1 - s): 0 at both ends, `sag` in the middle.
+                let sag = |share: f64| 4.0 * sag_m * share * (1.0 - share);
+                let at = |share: f64| from + (to - from) * share - Vector3::z() * sag(share);
+                let seen = seen_along(camera, at);
+                let pieces = strips(&seen, *width_m);
+                (seen, pieces, level)
             }
             Self::Bird { span_m, beats_per_s, level, path } => {
-                let up = BEAT_RAD * (TAU * beats_per_s * t).sin();
-                wings(camera, path.state(t).0, *span_m, up, *level)
+                let body = Seen::of(camera, path.state(t).0)?;
+                let up_rad = BEAT_RAD * (TAU * beats_per_s * t).sin();
+                let pieces = wings(&body, *span_m, up_rad);
+                (vec![Some(body)], pieces, level)
             }
             Self::Cloud { centre_m, radius_m, edge_m, level } => {
-                let centre = Point3::from(*centre_m);
-                let Some(seen) = Seen::of(camera, centre) else { return Vec::new() };
-                let shape = RenderedShape::Disc {
-                    centre: seen.pixel,
-                    radius: radius_m * seen.scale,
-                    edge: edge_m * seen.scale,
-                    level: *level,
-                };
-                vec![(seen.range, shape)]
+                let centre = Seen::of(camera, Point3::from(*centre_m))?;
+                let (radius, edge) = (radius_m * centre.scale, edge_m * centre.scale);
+                let disc = Piece::Disc { centre: centre.pixel, radius, edge };
+                (vec![Some(centre)], vec![disc], level)
             }
-        }
+        };
+        let ranges: Vec<f64> = seen.iter().flatten().map(|point| point.range).collect();
+        let range = ranges.iter().sum::<f64>() / ranges.len() as f64;
+        (!pieces.is_empty()).then_some((range, RenderedThing { pieces, level: *level }))
     }
-}
-
-/// The point of a wire at a share of the way between its ends.
-fn wire_point([from, to]: [Point3<f64>; 2], sag_m: f64, share: f64) -> Point3<f64> {
-    // z -= 4 sag s (1 - s): 0 at both ends, `sag` in the middle.
-    from + (to - from) * share - Vector3::z() * (4.0 * sag_m * share * (1.0 - share))
 }
 
 /// A point as a camera sees it.
@@ -154,50 +155,33 @@ impl Seen {
     fn of(camera: &Camera, point: Point3<f64>) -> Option<Self> {
         let pixel = camera.project(point)?;
         let range = (point - camera.pose().position()).norm();
-        Some(Self {
-            pixel: [pixel.x(), pixel.y()],
-            range,
-            scale: camera.model().intrinsics().fx / range,
-        })
+        let scale = camera.model().intrinsics().fx / range;
+        Some(Self { pixel: [pixel.x(), pixel.y()], range, scale })
     }
 }
 
-/// A line through space (`at`, from 0 to 1) as strips of an image.
-fn pieces(
-    camera: &Camera,
-    at: impl Fn(f64) -> Point3<f64>,
-    width_m: f64,
-    level: f32,
-) -> Vec<(f64, RenderedShape)> {
-    let points: Vec<Option<Seen>> = (0..=PIECES)
-        .map(|piece| Seen::of(camera, at(f64::from(piece) / f64::from(PIECES))))
-        .collect();
-    let strips = points.windows(2).filter_map(|ends| {
-        let [Some(from), Some(to)] = ends else { return None };
-        let width = width_m * (from.scale + to.scale) / 2.0;
-        let strip = RenderedShape::Strip { from: from.pixel, to: to.pixel, width, level };
-        Some(((from.range + to.range) / 2.0, strip))
-    });
-    strips.collect()
+/// Points of a line through space (`at`, from 0 to 1) as a camera sees them; `None` where one is not
+/// before it.
+fn seen_along(camera: &Camera, at: impl Fn(f64) -> Point3<f64>) -> Vec<Option<Seen>> {
+    let point = |piece| Seen::of(camera, at(f64::from(piece) / f64::from(PIECES)));
+    (0..=PIECES).map(point).collect()
 }
 
-/// The two wings of a bird that flies across the image, `up` rad above the horizontal.
-fn wings(
-    camera: &Camera,
-    place: Point3<f64>,
-    span_m: f64,
-    up: f64,
-    level: f32,
-) -> Vec<(f64, RenderedShape)> {
-    let Some(seen) = Seen::of(camera, place) else { return Vec::new() };
-    let [x, y] = seen.pixel;
-    let span = span_m * seen.scale;
-    let tip = |side: f64| [x + side * span / 2.0 * up.cos(), y - span / 2.0 * up.sin()];
-    [-1.0, 1.0]
-        .map(|side| {
-            let width = WING * span;
-            let wing = RenderedShape::Strip { from: seen.pixel, to: tip(side), width, level };
-            (seen.range, wing)
-        })
-        .into()
+/// The strips between neighbouring points of a line of this diameter.
+fn strips(points: &[Option<Seen>], width_m: f64) -> Vec<Piece> {
+    let strip = |ends: &[Option<Seen>]| {
+        let [Some(from), Some(to)] = ends else { return None };
+        let width = width_m * (from.scale + to.scale) / 2.0;
+        Some(Piece::Strip { from: from.pixel, to: to.pixel, width })
+    };
+    points.windows(2).filter_map(strip).collect()
+}
+
+/// The two wings of a bird that flies across the image, `up_rad` above the horizontal.
+fn wings(body: &Seen, span_m: f64, up_rad: f64) -> Vec<Piece> {
+    let [x, y] = body.pixel;
+    let span = span_m * body.scale;
+    let tip = |side: f64| [x + side * span / 2.0 * up_rad.cos(), y - span / 2.0 * up_rad.sin()];
+    let wing = |side| Piece::Strip { from: body.pixel, to: tip(side), width: WING * span };
+    [-1.0, 1.0].map(wing).into()
 }

@@ -40,88 +40,110 @@ pub(crate) struct RenderedTarget {
     pub(crate) blur: f64,
 }
 
-/// A shape of one brightness in an image, px.
+/// A thing of one brightness in an image: the pieces that it is made of, px.
+#[derive(Clone, Debug)]
+pub(crate) struct RenderedThing {
+    pub(crate) pieces: Vec<Piece>,
+    /// Its brightness, 8-bit levels.
+    pub(crate) level: f32,
+}
+
+/// A piece of a thing, px.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum RenderedShape {
+pub(crate) enum Piece {
     /// A straight strip.
     Strip {
         /// Its ends.
         from: [f64; 2],
         to: [f64; 2],
         width: f64,
-        level: f32,
     },
     /// A disc whose edge is as wide as this.
-    Disc { centre: [f64; 2], radius: f64, edge: f64, level: f32 },
+    Disc { centre: [f64; 2], radius: f64, edge: f64 },
 }
 
-impl RenderedShape {
+impl RenderedThing {
     /// Draws it over an image that a lens blurs with this standard deviation, px.
     pub(crate) fn draw(&self, image: &mut [f32], width: usize, blur: f64) {
-        let height = image.len() / width.max(1);
-        // A box of length h has the standard deviation h / sqrt(12); no blur is below a pixel.
-        let soft = (12f64.sqrt() * blur).max(1.0);
-        let (low, high) = self.bounds(soft);
-        if high[0] < 0.0 || high[1] < 0.0 || low[0] > width as f64 || low[1] > height as f64 {
-            return;
+        // A box of length h has the variance h^2 / 12, the pixel's own box 1 / 12; together they
+        // have the blur's.
+        let soft = (12.0 * blur * blur - 1.0).max(1e-6).sqrt();
+        // Where pieces meet the shares of a pixel that they cover add up, before it is painted.
+        let mut covered = vec![0.0_f32; image.len()];
+        for piece in &self.pieces {
+            piece.cover(&mut covered, width, soft);
         }
-        let range = |i: usize, side: usize| {
-            low[i].max(0.0) as usize..(high[i].min(side as f64 - 1.0) as usize + 1).min(side)
+        for (pixel, covered) in image.iter_mut().zip(covered) {
+            *pixel += covered.min(1.0) * (self.level - *pixel);
+        }
+    }
+}
+
+impl Piece {
+    /// Adds the share of each pixel that it covers.
+    fn cover(&self, shares: &mut [f32], width: usize, soft: f64) {
+        let height = shares.len() / width.max(1);
+        let [columns, rows] = self.reach(soft);
+        let within = |[low, high]: [f64; 2], side: usize| {
+            (low.clamp(0.0, side as f64) as usize)..(high.clamp(0.0, side as f64) as usize)
         };
-        for y in range(1, height) {
-            for x in range(0, width) {
-                let (cover, level) = self.cover([x as f64, y as f64], soft);
-                let pixel = &mut image[y * width + x];
-                *pixel += cover as f32 * (level - *pixel);
+        for y in within(rows, height) {
+            for x in within(columns, width) {
+                shares[y * width + x] += self.share([x as f64, y as f64], soft) as f32;
             }
         }
     }
 
-    /// The corners of the rectangle outside which nothing is covered.
-    fn bounds(&self, soft: f64) -> ([f64; 2], [f64; 2]) {
-        match *self {
-            Self::Strip { from, to, width, .. } => {
-                let reach = width / 2.0 + soft;
-                (
-                    [0, 1].map(|i| from[i].min(to[i]) - reach),
-                    [0, 1].map(|i| from[i].max(to[i]) + reach),
-                )
+    /// The first and the last column, then row, that it may cover, the last one excluded.
+    fn reach(&self, soft: f64) -> [[f64; 2]; 2] {
+        let beyond = soft + 2.0;
+        [0, 1].map(|i| match *self {
+            Self::Strip { from, to, width } => {
+                let reach = width / 2.0 + beyond;
+                [from[i].min(to[i]) - reach, from[i].max(to[i]) + reach]
             }
-            Self::Disc { centre, radius, edge, .. } => {
-                let reach = radius + edge + soft;
-                (centre.map(|at| at - reach), centre.map(|at| at + reach))
+            Self::Disc { centre, radius, edge } => {
+                let reach = radius + edge + beyond;
+                [centre[i] - reach, centre[i] + reach]
             }
-        }
+        })
     }
 
-    /// The share of a pixel that it covers, and its brightness.
-    fn cover(&self, [x, y]: [f64; 2], soft: f64) -> (f64, f32) {
+    /// The share of a pixel that it covers.
+    fn share(&self, [x, y]: [f64; 2], soft: f64) -> f64 {
         match *self {
-            Self::Strip { from, to, width, level } => {
+            Self::Strip { from, to, width } => {
                 let along = [to[0] - from[0], to[1] - from[1]];
                 let length = along[0].hypot(along[1]).max(f64::MIN_POSITIVE);
                 let off = [x - from[0], y - from[1]];
                 // Components along the strip and across it.
                 let s = (off[0] * along[0] + off[1] * along[1]) / length;
                 let d = (off[0] * along[1] - off[1] * along[0]) / length;
-                let across = overlap([d - width / 2.0, d + width / 2.0], soft);
-                // Half a pixel from its end: the next piece begins there, and both add up to one.
-                let within = overlap([s - length, s], 1.0);
-                (across * within, level)
+                let across = covered([d - width / 2.0, d + width / 2.0], soft);
+                // Sharp ends: where the next piece begins both add up to one.
+                across * covered([s - length, s], 1e-3)
             }
-            Self::Disc { centre, radius, edge, level } => {
+            Self::Disc { centre, radius, edge } => {
                 let far = (x - centre[0]).hypot(y - centre[1]);
-                // Linear over the edge and the blur.
-                (((radius - far) / (edge + soft) + 0.5).clamp(0.0, 1.0), level)
+                // Linear over the edge, the blur and the pixel.
+                ((radius - far) / (edge + soft + 1.0) + 0.5).clamp(0.0, 1.0)
             }
         }
     }
 }
 
-/// The share of a box of this length about zero that an interval covers.
-fn overlap([low, high]: [f64; 2], length: f64) -> f64 {
-    let half = length / 2.0;
-    ((high.min(half) - low.max(-half)) / length).max(0.0)
+/// The share of the pixel about zero that an interval covers when it is blurred by a box of length
+/// `soft`: the interval, the blur's box and the pixel's folded, so that the shares of all pixels add
+/// up to the interval's length.
+fn covered([low, high]: [f64; 2], soft: f64) -> f64 {
+    // Second integral of the box of unit area: 0 before it, t after it, a parabola in between.
+    let integral = |t: f64| match t {
+        t if t <= -soft / 2.0 => 0.0,
+        t if t >= soft / 2.0 => t,
+        t => (t + soft / 2.0).powi(2) / (2.0 * soft),
+    };
+    let from = |edge: f64| integral(edge + 0.5) - integral(edge - 0.5);
+    from(high) - from(low)
 }
 
 /// Whether a silhouette covers a place, in units of half its span: a body, two arms and four rotors
@@ -210,8 +232,8 @@ mod tests {
     fn a_strip_covers_as_much_as_its_length_and_width_wherever_it_lies() {
         for (from, to) in [([10.2, 10.7], [40.9, 33.1]), ([12.5, 5.5], [12.5, 45.0])] {
             let mut image = vec![100.0_f32; 60 * 50];
-            let strip = RenderedShape::Strip { from, to, width: 0.6, level: 200.0 };
-            strip.draw(&mut image, 60, 0.8);
+            let pieces = vec![Piece::Strip { from, to, width: 0.6 }];
+            RenderedThing { pieces, level: 200.0 }.draw(&mut image, 60, 0.8);
             let sum: f64 = image.iter().map(|v| f64::from(v - 100.0) / 100.0).sum();
             let length = (to[0] - from[0]).hypot(to[1] - from[1]);
             // Sampled at whole pixels: a hundredth.

@@ -5,7 +5,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use crate::render::{RenderedShape, RenderedTarget, draw};
+use crate::render::{RenderedTarget, RenderedThing, draw};
 use crate::sky::{Panorama, sky};
 use crate::{
     RenderedFrame, Scene, SceneCamera, SceneClutter, SceneError, SceneTarget, SimulatedMount,
@@ -33,7 +33,7 @@ pub struct World {
 /// A thing before a camera.
 enum InView {
     Target(RenderedTarget),
-    Clutter(RenderedShape),
+    Clutter(RenderedThing),
 }
 
 /// A camera of a scene.
@@ -172,7 +172,7 @@ impl SimulatedCamera {
         for thing in self.in_view(camera, true_s) {
             match thing {
                 InView::Target(target) => draw(&mut image, width, height, &target),
-                InView::Clutter(shape) => shape.draw(&mut image, width, self.description.blur_px),
+                InView::Clutter(thing) => thing.draw(&mut image, width, self.description.blur_px),
             }
         }
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
@@ -197,8 +197,8 @@ impl SimulatedCamera {
             let appearance = self.appearance(camera, target, t);
             things.extend(appearance.map(|appearance| (range, InView::Target(appearance))));
         }
-        let shapes = self.clutter.iter().flat_map(|thing| thing.shapes(camera, t));
-        things.extend(shapes.map(|(range, shape)| (range, InView::Clutter(shape))));
+        let clutter = self.clutter.iter().filter_map(|thing| thing.appearance(camera, t));
+        things.extend(clutter.map(|(range, thing)| (range, InView::Clutter(thing))));
         things.sort_by(|(one, _), (other, _)| other.total_cmp(one));
         things.into_iter().map(|(_, thing)| thing).collect()
     }
@@ -259,6 +259,44 @@ mod tests {
             let sky = camera.sky[index];
             assert!(f32::from(frame.brightness[index]) < sky - 30.0, "target {}", target.id);
         }
+    }
+
+    #[test]
+    fn a_mast_hides_what_is_behind_it_and_not_what_is_before_it() {
+        let mut scene: Scene =
+            toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
+        let camera = scene.build().unwrap().cameras()[0].clone();
+        let (position, target) =
+            (camera.camera().pose().position(), scene.targets[0].path.state(3.0).0);
+        let index = (3.0 * camera.description().rate_hz) as u64;
+        let pixel = camera.camera().project(target).unwrap();
+        let mut seen_with_mast_at = |share: f64| {
+            let foot = position + (target - position) * share - Vector3::z() * 30.0;
+            scene.clutter = vec![SceneClutter::Mast {
+                foot_m: foot.coords.into(),
+                height_m: 60.0,
+                width_m: 3.0 * share,
+                level: 250.0,
+            }];
+            let frame = scene.build().unwrap().cameras()[0].frame(index);
+            frame.brightness[pixel.y().round() as usize * frame.width + pixel.x().round() as usize]
+        };
+        // Noise of a few levels about the mast's brightness, and about that less the darkness.
+        assert!(seen_with_mast_at(0.5) > 230);
+        assert!(seen_with_mast_at(1.5) < 200);
+    }
+
+    #[test]
+    fn a_thing_of_impossible_size_is_refused() {
+        let mut scene: Scene =
+            toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
+        scene.clutter = vec![SceneClutter::Cloud {
+            centre_m: [0.0, 80.0, 40.0],
+            radius_m: -1.0,
+            edge_m: 1.0,
+            level: 100.0,
+        }];
+        assert!(matches!(scene.build(), Err(SceneError::Clutter { index: 0 })));
     }
 
     #[test]
