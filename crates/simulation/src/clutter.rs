@@ -169,12 +169,14 @@ fn seen_along(camera: &Camera, at: impl Fn(f64) -> Point3<f64>) -> Vec<Option<Se
 
 /// The strips between neighbouring points of a line of this diameter.
 fn strips(points: &[Option<Seen>], width_m: f64) -> Vec<Piece> {
-    let strip = |ends: &[Option<Seen>]| {
-        let [Some(from), Some(to)] = ends else { return None };
-        let width = width_m * (from.scale + to.scale) / 2.0;
-        Some(Piece::Strip { from: from.pixel, to: to.pixel, width })
-    };
-    points.windows(2).filter_map(strip).collect()
+    let mut strips = Vec::new();
+    for ends in points.windows(2) {
+        if let [Some(from), Some(to)] = ends {
+            let width = width_m * (from.scale + to.scale) / 2.0;
+            strips.push(Piece::Strip { from: from.pixel, to: to.pixel, width });
+        }
+    }
+    strips
 }
 
 /// The two wings of a bird that flies across the image, `up_rad` above the horizontal.

@@ -136,14 +136,18 @@ impl Piece {
 /// `soft`: the interval, the blur's box and the pixel's folded, so that the shares of all pixels add
 /// up to the interval's length.
 fn covered([low, high]: [f64; 2], soft: f64) -> f64 {
-    // Second integral of the box of unit area: 0 before it, t after it, a parabola in between.
-    let integral = |t: f64| match t {
-        t if t <= -soft / 2.0 => 0.0,
-        t if t >= soft / 2.0 => t,
-        t => (t + soft / 2.0).powi(2) / (2.0 * soft),
-    };
-    let from = |edge: f64| integral(edge + 0.5) - integral(edge - 0.5);
+    let from = |edge: f64| twice_integrated(edge + 0.5, soft) - twice_integrated(edge - 0.5, soft);
     from(high) - from(low)
+}
+
+/// The second integral of a box of unit area and this length about zero: 0 before it, `t` after it,
+/// a parabola in between.
+fn twice_integrated(t: f64, length: f64) -> f64 {
+    match t {
+        t if t <= -length / 2.0 => 0.0,
+        t if t >= length / 2.0 => t,
+        t => (t + length / 2.0).powi(2) / (2.0 * length),
+    }
 }
 
 /// Whether a silhouette covers a place, in units of half its span: a body, two arms and four rotors

@@ -250,10 +250,7 @@ impl PlaceHypotheses {
                 }
                 let mut motion = hypothesis.motion.clone();
                 let expected = motion.found();
-                let at = [0, 1].map(|i| AxisMeasurement {
-                    position: region.origin[i] + part.mean[i],
-                    variance: part.variance[i],
-                });
+                let at = part.in_image(region.origin);
                 if motion.nis(at) < UNEXPECTED {
                     // The peak's moments have the prior in them already, so they replace the
                     // prediction.

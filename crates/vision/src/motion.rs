@@ -286,17 +286,30 @@ impl ImageMotion {
     /// Squared normalised innovation of a measurement, summed over both axes, under the mixture of
     /// all models: chi-square with two degrees of freedom if the filters are consistent.
     pub(crate) fn nis(&self, at: [AxisMeasurement; 2]) -> f64 {
-        let axis = |i: usize| {
-            let mut parts = [(0.0, at[i]); WAYS];
-            for ((part, way), weight) in parts.iter_mut().zip(&self.ways).zip(self.weights) {
-                let AxisMeasurement { position, variance } = way[i].found();
-                *part = (weight, AxisMeasurement { position, variance: variance + at[i].variance });
-            }
-            // The squared normal deviate of the mixture's tail probability: chi-square also where
-            // the mixture is not normal.
-            normal_score(at[i].position, parts).powi(2)
-        };
-        axis(0) + axis(1)
+        self.score_on(0, at[0]).powi(2) + self.score_on(1, at[1]).powi(2)
+    }
+
+    /// The normal deviate of the tail probability of a measurement on one axis, under the mixture of
+    /// all models: standard normal also where the mixture is not normal.
+    fn score_on(&self, i: usize, at: AxisMeasurement) -> f64 {
+        let mut parts = [(0.0, at); WAYS];
+        for ((part, way), weight) in parts.iter_mut().zip(&self.ways).zip(self.weights) {
+            let AxisMeasurement { position, variance } = way[i].found();
+            *part = (weight, AxisMeasurement { position, variance: variance + at.variance });
+        }
+        normal_score(at.position, parts)
+    }
+
+    /// The logarithm of `N(z; H x_w, H P_w H' + R)`, the likelihood of a measurement under one model,
+    /// but for a constant.
+    fn log_likelihood(&self, way: usize, at: [AxisMeasurement; 2]) -> f64 {
+        let mut sum = 0.0;
+        for (axis, at) in self.ways[way].iter().zip(at) {
+            let prior = axis.found();
+            let variance = prior.variance + at.variance;
+            sum += -0.5 * ((at.position - prior.position).powi(2) / variance + variance.ln());
+        }
+        sum
     }
 
     /// Variance of the measurement noise over the expected one.
@@ -337,16 +350,8 @@ impl ImageMotion {
     pub(crate) fn update(&mut self, evidence: &PlaceEvidence) {
         let PlaceEvidence { near, at, elsewhere, elsewhere_at } = *evidence;
         self.measured = at.map(|at| at.variance);
-        // L_w = N(z; H x_w, H P_w H' + R), the likelihood of the measurement under each model, as a
-        // logarithm so that none underflows.
-        let likelihoods = [0, 1, 2, 3].map(|way: usize| {
-            let axis = |i: usize| {
-                let prior = self.ways[way][i].found();
-                let variance = prior.variance + at[i].variance;
-                -0.5 * ((at[i].position - prior.position).powi(2) / variance + variance.ln())
-            };
-            axis(0) + axis(1)
-        });
+        // As logarithms, so that none underflows.
+        let likelihoods = [0, 1, 2, 3].map(|way: usize| self.log_likelihood(way, at));
         let largest = likelihoods.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let likelihoods = likelihoods.map(|logarithm| (logarithm - largest).exp());
         let mean: f64 = likelihoods.iter().zip(self.weights).map(|(l, w)| l * w).sum();

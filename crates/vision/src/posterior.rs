@@ -6,6 +6,7 @@
 //! are taken relative to the largest, so that no exponential overflows.
 
 use crossfix_correlation::Plane;
+use crossfix_filter::AxisMeasurement;
 use pulp::{Arch, Simd, WithSimd};
 
 use crate::lanes;
@@ -33,6 +34,16 @@ pub(crate) struct PosteriorPart {
     pub(crate) mass: f64,
     pub(crate) mean: [f64; 2],
     pub(crate) variance: [f64; 2],
+}
+
+impl PosteriorPart {
+    /// Its mean and variance in an image in which the first placement has its middle at `origin`.
+    pub(crate) fn in_image(&self, origin: [f64; 2]) -> [AxisMeasurement; 2] {
+        [0, 1].map(|i| AxisMeasurement {
+            position: origin[i] + self.mean[i],
+            variance: self.variance[i],
+        })
+    }
 }
 
 /// Posterior of the target's place given the image, in three parts: near the peak, elsewhere in the

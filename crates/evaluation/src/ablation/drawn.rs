@@ -125,13 +125,16 @@ fn wires(noise: &mut Noise) -> Vec<SceneClutter> {
 
 /// Birds as large and as dark as the target, on paths of their own.
 fn birds(noise: &mut Noise) -> Vec<SceneClutter> {
-    let bird = |_| SceneClutter::Bird {
+    (0..4).map(|_| bird(noise)).collect()
+}
+
+fn bird(noise: &mut Noise) -> SceneClutter {
+    SceneClutter::Bird {
         span_m: SPAN_M * (0.7 + 0.6 * noise.uniform()),
         beats_per_s: 2.0 + 4.0 * noise.uniform(),
         level: 70.0,
         path: path(noise, 95.0),
-    };
-    (0..4).map(bird).collect()
+    }
 }
 
 /// Clouds: a large bright one and a large dark one behind the target, small ones before it.

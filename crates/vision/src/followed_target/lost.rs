@@ -38,11 +38,7 @@ impl Target {
         let fit = Sought { state, identity, memory }.find(frame, scratch)?;
         self.identity.begin_probation(&self.state, frame);
         let (found, expected) = (fit.found(), self.state.motion.found());
-        let is_near = |i: usize| {
-            (found[i].position - expected[i].position).powi(2)
-                < CONTINUES_WITHIN * expected[i].variance
-        };
-        if self.state.missed < CONTINUES_IMAGES && is_near(0) && is_near(1) {
+        if self.state.missed < CONTINUES_IMAGES && are_near(found, expected) {
             self.state.motion.condition([0, 1].map(|i| AxisMeasurement {
                 variance: found[i].variance.min(expected[i].variance),
                 ..found[i]
@@ -72,4 +68,11 @@ impl Target {
         self.identity.go_on_with_probation(step.certainty * frame.interval);
         step
     }
+}
+
+/// Whether a place is near the prediction on both axes.
+fn are_near(found: [AxisMeasurement; 2], expected: [AxisMeasurement; 2]) -> bool {
+    found.iter().zip(expected).all(|(found, expected)| {
+        (found.position - expected.position).powi(2) < CONTINUES_WITHIN * expected.variance
+    })
 }

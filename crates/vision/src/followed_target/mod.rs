@@ -20,7 +20,7 @@ use crate::gate::Region;
 use crate::hypotheses::PlaceHypotheses;
 use crate::identity::Identity;
 use crate::motion::PlaceEvidence;
-use crate::posterior::{Posterior, PosteriorPart};
+use crate::posterior::Posterior;
 use crate::scratch::Scratch;
 use crate::search_memory::SearchMemory;
 use crate::state::{SEEN, TargetBelief};
@@ -272,20 +272,15 @@ impl Target {
             .motion
             .found()
             .map(|at| AxisMeasurement { variance: at.variance + floor, ..at });
-        let in_image = |part: &PosteriorPart, i: usize| AxisMeasurement {
-            position: origin[i] + part.mean[i],
-            variance: part.variance[i],
-        };
-        let at = if narrow {
-            fitted
-        } else {
-            [0, 1].map(|i| without_prior(in_image(&posterior.near, i), expected[i]))
-        };
+        let (near_at, elsewhere_at) =
+            (posterior.near.in_image(origin), posterior.elsewhere.in_image(origin));
+        let at =
+            if narrow { fitted } else { [0, 1].map(|i| without_prior(near_at[i], expected[i])) };
         PlaceEvidence {
             near: posterior.near.mass,
             at,
             elsewhere: posterior.elsewhere.mass,
-            elsewhere_at: [0, 1].map(|i| in_image(&posterior.elsewhere, i)),
+            elsewhere_at,
         }
     }
 
