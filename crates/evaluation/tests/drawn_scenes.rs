@@ -18,9 +18,9 @@ fn row<'a>(tables: &'a [Table], name: &str, series: &str) -> &'a TableRow {
 #[test]
 fn targets_are_followed_and_what_is_no_target_is_not_shown_for_one() {
     let tables = ablate_drawn(OPTIONS, &[TrackerPart::Arrival], |_, _, _| ());
-    // Frames lost, %. A scene of masts hides its target in up to 7 % of them, a cloud's in 10. With
-    // five other seeds these were at most 17, 5, 11 and 1.
-    for (kind, most) in [("masts", 25.0), ("wires", 10.0), ("edges", 18.0), ("pan", 2.0)] {
+    // Frames lost, %; masts and clouds also hide the target. Sixteen scenes of each kind of another
+    // seed lose 9, 4, 10 and 0.2 % in the mean, with standard errors for four of 5, 1.3, 6 and 0.2.
+    for (kind, most) in [("masts", 25.0), ("wires", 10.0), ("edges", 18.0), ("pan", 1.0)] {
         let all = row(&tables, &format!("ablation-{kind}"), "all parts");
         assert!(all.ours < most, "{kind}: {:.1} % of the frames are lost", all.ours);
         assert!(all.x < 1.0, "{kind}: something else is shown for {:.1} s", all.x);

@@ -52,7 +52,13 @@ impl Region {
     }
 }
 
-/// Draws the boxes of an agent's targets.
+/// Sides of the least gate, the region in which an agent looks for a target in its next image, over
+/// the target's (Herasymenko 2021, section 1). An agent that is less sure of its prediction looks
+/// farther, which its messages do not say. With half of it what is drawn is hardly larger than the
+/// box.
+const GATE_SIDES: f64 = 3.0;
+
+/// Draws the boxes of an agent's targets and, fainter, the gates about them.
 pub(crate) fn boxes(
     stream: &RecordingStream,
     camera: &str,
@@ -73,6 +79,14 @@ pub(crate) fn boxes(
             .with_show_labels(false)
             .with_colors([colour::of(index)])
             .with_radii([Radius::new_ui_points(1.0)]),
+    )?;
+    let centres = boxes().map(|t| (scaled(t.pixel_x + 0.5), scaled(t.pixel_y + 0.5)));
+    let sizes = boxes().map(|t| (scaled(GATE_SIDES * t.width), scaled(GATE_SIDES * t.height)));
+    stream.log(
+        format!("{}/gates", image_path(camera)),
+        &Boxes2D::from_centers_and_sizes(centres, sizes)
+            .with_colors([colour::faint(index, 110)])
+            .with_radii([Radius::new_ui_points(0.5)]),
     )?;
     Ok(())
 }
