@@ -71,6 +71,10 @@ pub enum SceneClutter {
     },
 }
 
+/// Largest coordinate and size, m: nothing farther is seen from a site. With half of it the same.
+const FARTHEST_M: f64 = 1e6;
+/// Most beats of a wing per second: a hummingbird's. With half of it the same.
+const MOST_BEATS: f64 = 80.0;
 /// Straight pieces of which a mast or a wire consists in the image: lenses bend it. With half of
 /// them a wire's corners show in an image of 640 columns.
 const PIECES: u32 = 24;
@@ -84,21 +88,25 @@ const BEAT_RAD: f64 = 0.9;
 impl SceneClutter {
     /// Whether every number is one that a thing can have.
     pub(crate) fn is_possible(&self) -> bool {
-        let positive = |values: &[f64]| values.iter().all(|v| v.is_finite() && *v > 0.0);
-        let finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
+        // NaN is in no range.
+        let is_size = |values: &[f64]| values.iter().all(|v| *v > 0.0 && *v <= FARTHEST_M);
+        let is_place = |values: &[f64]| values.iter().all(|v| v.abs() <= FARTHEST_M);
         let (numbers, level) = match self {
             Self::Mast { foot_m, height_m, width_m, level } => {
-                (finite(foot_m) && positive(&[*height_m, *width_m]), level)
+                (is_place(foot_m) && is_size(&[*height_m, *width_m]), level)
             }
             Self::Wire { from_m, to_m, sag_m, width_m, level } => (
-                finite(from_m) && finite(to_m) && finite(&[*sag_m]) && positive(&[*width_m]),
+                is_place(from_m) && is_place(to_m) && is_place(&[*sag_m]) && is_size(&[*width_m]),
                 level,
             ),
-            Self::Bird { span_m, beats_per_s, level, path } => {
-                (positive(&[*span_m, *beats_per_s]) && path.is_possible(), level)
-            }
+            Self::Bird { span_m, beats_per_s, level, path } => (
+                is_size(&[*span_m])
+                    && (0.0..=MOST_BEATS).contains(beats_per_s)
+                    && path.is_possible(),
+                level,
+            ),
             Self::Cloud { centre_m, radius_m, edge_m, level } => {
-                (finite(centre_m) && positive(&[*radius_m, *edge_m]), level)
+                (is_place(centre_m) && is_size(&[*radius_m, *edge_m]), level)
             }
         };
         numbers && (0.0..=255.0).contains(level)
@@ -160,8 +168,8 @@ impl Seen {
     }
 }
 
-/// Points of a line through space (`at`, from 0 to 1) as a camera sees them; `None` where one is not
-/// before it.
+/// Points of a line through space (`at`, from 0 to 1) as a camera sees them; `None` where one is
+/// not before it.
 fn seen_along(camera: &Camera, at: impl Fn(f64) -> Point3<f64>) -> Vec<Option<Seen>> {
     let point = |piece| Seen::of(camera, at(f64::from(piece) / f64::from(PIECES)));
     (0..=PIECES).map(point).collect()

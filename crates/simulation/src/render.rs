@@ -133,8 +133,8 @@ impl Piece {
 }
 
 /// The share of the pixel about zero that an interval covers when it is blurred by a box of length
-/// `soft`: the interval, the blur's box and the pixel's folded, so that the shares of all pixels add
-/// up to the interval's length.
+/// `soft`: the interval, the blur's box and the pixel's folded. So the shares of all pixels add up
+/// to the interval's length.
 fn covered([low, high]: [f64; 2], soft: f64) -> f64 {
     let from = |edge: f64| twice_integrated(edge + 0.5, soft) - twice_integrated(edge - 0.5, soft);
     from(high) - from(low)

@@ -99,8 +99,8 @@ pub enum SceneError {
     },
     /// A thing beside the targets with impossible numbers.
     #[error(
-        "thing {index} of the clutter has a number that is not finite, a size that is not positive, \
-         or a brightness outside 0 to 255 levels"
+        "thing {index} of the clutter has a size that is not positive, a place or size beyond \
+         1000 km, more than 80 beats a second, or a brightness outside 0 to 255 levels"
     )]
     Clutter {
         /// Its place in the list, from 0.

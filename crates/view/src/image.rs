@@ -52,10 +52,10 @@ impl Region {
     }
 }
 
-/// Sides of the least gate, the region in which an agent looks for a target in its next image, over
-/// the target's (Herasymenko 2021, section 1). An agent that is less sure of its prediction looks
-/// farther, which its messages do not say. With half of it what is drawn is hardly larger than the
-/// box.
+/// Sides of the papers' gate, the region in which a target is looked for, over the target's
+/// (Herasymenko 2021, section 1). An agent adds its reference's margin, and looks farther where it
+/// is less sure of its prediction: its messages do not say either. With half of it what is drawn is
+/// hardly larger than the box.
 const GATE_SIDES: f64 = 3.0;
 
 /// Draws the boxes of an agent's targets and, fainter, the gates about them.

@@ -48,7 +48,8 @@ pub struct TrackerConfig {
     /// Inverse of the share of the reference's energy that a mismatch with the target may take.
     /// Default 30; at 60 textured background is taken for targets.
     pub mismatch: f64,
-    /// Standard deviation of an image's contrast about what is expected, as a share of it. Default 0.5.
+    /// Standard deviation of an image's contrast about what is expected, as a share of it. Default
+    /// 0.5.
     pub contrast_sd: f64,
     /// Share of the images in which a target can be seen, apart from a blur or a bird in front of
     /// it. Default 0.95.

@@ -289,8 +289,8 @@ impl ImageMotion {
         self.score_on(0, at[0]).powi(2) + self.score_on(1, at[1]).powi(2)
     }
 
-    /// The normal deviate of the tail probability of a measurement on one axis, under the mixture of
-    /// all models: standard normal also where the mixture is not normal.
+    /// The normal deviate of the tail probability of a measurement on one axis, under the mixture
+    /// of all models: standard normal also where the mixture is not normal.
     fn score_on(&self, i: usize, at: AxisMeasurement) -> f64 {
         let mut parts = [(0.0, at); WAYS];
         for ((part, way), weight) in parts.iter_mut().zip(&self.ways).zip(self.weights) {
@@ -300,8 +300,8 @@ impl ImageMotion {
         normal_score(at.position, parts)
     }
 
-    /// The logarithm of `N(z; H x_w, H P_w H' + R)`, the likelihood of a measurement under one model,
-    /// but for a constant.
+    /// The logarithm of `N(z; H x_w, H P_w H' + R)`, the likelihood of a measurement under one
+    /// model, but for a constant.
     fn log_likelihood(&self, way: usize, at: [AxisMeasurement; 2]) -> f64 {
         let mut sum = 0.0;
         for (axis, at) in self.ways[way].iter().zip(at) {

@@ -17,8 +17,8 @@ use crate::surroundings::Surroundings;
 use crate::tracker_part::TrackerPart;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
-/// Images without the target after which it is searched for: noise hides it in one image and not
-/// in the next. With one, each blurred image begins a search; with six a lost target runs on with its
+/// Images without the target after which it is searched for: noise hides it in one image and not in
+/// the next. With one, each blurred image begins a search; with six a lost target runs on with its
 /// prediction for 0.1 s longer, at thirty images a second. (A limit of 0.09 s, which is one image
 /// at ten a second, loses a fifth more frames there.)
 const SEARCH_AFTER_IMAGES: u32 = 3;

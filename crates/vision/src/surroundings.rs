@@ -1,5 +1,5 @@
-//! The mean of what is about a target in its images: what its figure is looked for in as long as its
-//! first appearance is not clear of noise (see [`crate::centring`]).
+//! The mean of what is about a target in its images: what its figure is looked for in as long as
+//! its first appearance is not clear of noise (see [`crate::centring`]).
 
 use crossfix_correlation::Plane;
 

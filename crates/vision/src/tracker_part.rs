@@ -15,6 +15,8 @@ pub enum TrackerPart {
     MeanFigure,
     /// The reference is learnt from the target's images.
     LearntReference,
+    /// An image that matches worse than usual is hardly learnt.
+    UsualMatch,
     /// The reference follows the target's size and direction.
     Shape,
     /// The contrast that is expected of the target follows the one that is measured.
@@ -46,10 +48,11 @@ pub enum TrackerPart {
 
 impl TrackerPart {
     /// All parts.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 17] = [
         Self::Figure,
         Self::MeanFigure,
         Self::LearntReference,
+        Self::UsualMatch,
         Self::Shape,
         Self::FollowedContrast,
         Self::MotionModels,
@@ -72,6 +75,7 @@ impl fmt::Display for TrackerPart {
             Self::Figure => "the box is moved onto its figure",
             Self::MeanFigure => "the figure in the mean of images",
             Self::LearntReference => "the reference is learnt",
+            Self::UsualMatch => "learning by the usual match",
             Self::Shape => "size and direction are followed",
             Self::FollowedContrast => "the contrast is followed",
             Self::MotionModels => "several motion models",
@@ -90,7 +94,7 @@ impl fmt::Display for TrackerPart {
 }
 
 impl TrackerConfig {
-    /// The same tracker without one of its parts.
+    /// The same tracker without one of its parts. Only one is left out at a time.
     ///
     /// ```
     /// use crossfix_vision::{TrackerConfig, TrackerPart};
@@ -108,7 +112,7 @@ impl TrackerConfig {
         }
     }
 
-    /// Whether a part takes part.
+    /// Whether a part takes part; those that are settings of the configuration are asked there.
     pub(crate) fn has(&self, part: TrackerPart) -> bool {
         self.left_out != Some(part)
     }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use crossfix_vision::PixelBox;
 
 /// The boxes of a table with the columns frame,x,y,w,h, by frame; a row without a box is a frame
@@ -22,10 +22,46 @@ pub(crate) fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, PixelBox>
     let mut labels = BTreeMap::new();
     for record in reader.records() {
         let record = record.with_context(context)?;
-        let number = |column: usize| record.get(column)?.trim().parse::<f64>().ok();
-        if let [Some(frame), Some(x), Some(y), Some(width), Some(height)] = columns.map(number) {
-            labels.insert(frame as u64, PixelBox { x, y, width, height });
+        let cells = columns.map(|column| record.get(column).unwrap_or_default().trim());
+        if cells.iter().all(|cell| !cell.is_empty()) {
+            let label = label(cells);
+            let (frame, place) = label.with_context(|| {
+                format!("{}: a row has frame,x,y,w,h = {}", path.display(), cells.join(","))
+            })?;
+            labels.insert(frame, place);
         }
     }
     Ok(labels)
+}
+
+/// A frame's number and the box in it.
+fn label([frame, x, y, width, height]: [&str; 5]) -> anyhow::Result<(u64, PixelBox)> {
+    let place =
+        PixelBox { x: x.parse()?, y: y.parse()?, width: width.parse()?, height: height.parse()? };
+    ensure!(place.is_possible(), "no target has such a box");
+    Ok((frame.parse()?, place))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+    use super::*;
+
+    #[test]
+    fn rows_without_a_box_are_left_out_and_impossible_ones_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("labels.csv");
+        let read = |rows: &str| {
+            std::fs::write(&path, format!("frame,x,y,w,h\n{rows}")).unwrap();
+            read_labels(&path)
+        };
+        let labels = read("0,1.5,2,10,6\n1,,,,\n2,3,4,10,6\n").unwrap();
+        assert_eq!(labels.keys().copied().collect::<Vec<_>>(), [0, 2]);
+        for wrong in ["-1,1,2,10,6", "nan,1,2,10,6", "1e300,1,2,10,6", "0,1,2,-5,6", "0,nan,2,5,6"]
+        {
+            let error = format!("{:#}", read(wrong).unwrap_err());
+            assert!(error.contains(wrong), "{error}");
+        }
+    }
 }

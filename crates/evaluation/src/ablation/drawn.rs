@@ -66,10 +66,10 @@ pub(super) const KINDS: [DrawnKind; 6] = [
     },
     DrawnKind {
         name: "ablation-pan",
-        title: "a camera that pans",
-        noise_levels: 20.0,
+        title: "a camera that pans over masts",
+        noise_levels: 3.0,
         pan_rad: 0.3,
-        clutter: |_| Vec::new(),
+        clutter: masts,
     },
 ];
 
@@ -107,7 +107,7 @@ fn masts(noise: &mut Noise) -> Vec<SceneClutter> {
         .into()
 }
 
-/// Wires along which the target flies, and which it crosses.
+/// Wires behind the target, which its sight line crosses.
 fn wires(noise: &mut Noise) -> Vec<SceneClutter> {
     [-12.0, 0.0, 12.0]
         .map(|up| {
@@ -210,7 +210,7 @@ impl DrawnRun {
                 let mut centre = label.centre();
                 centre.x += ASIDE_PX;
                 let given = PixelBox::about(centre, LARGER * label.width, LARGER * label.height);
-                trials.extend(configurations(parts).filter_map(|config| Trial::new(config, given)));
+                trials.extend(configurations(parts).map(|config| Trial::new(config, given)));
             }
             let time = Timestamp::from_seconds(rendered.own_s);
             trials.iter_mut().for_each(|trial| trial.step(&image, time, label));

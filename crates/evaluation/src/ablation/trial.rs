@@ -32,8 +32,8 @@ impl TrialScore {
         1.0 - f64::from(self.near) / f64::from(self.labelled)
     }
 
-    /// Root mean square error of the centre while the target was followed, px; not a number where it
-    /// never was.
+    /// Root mean square error of the centre while the target was followed, px; not a number where
+    /// it never was.
     pub(super) fn rms_px(&self) -> f64 {
         (self.squares / f64::from(self.near)).sqrt()
     }
@@ -49,18 +49,25 @@ pub(super) struct Trial {
 }
 
 impl Trial {
-    /// A trial that begins with the next image; `None` if the configuration is impossible.
-    pub(super) fn new(config: TrackerConfig, given: PixelBox) -> Option<Self> {
-        let mut tracker = ImageTracker::new(config).ok()?;
+    /// A trial that begins with the next image.
+    ///
+    /// # Panics
+    /// If the configuration is impossible: they are all this crate's own.
+    pub(super) fn new(config: TrackerConfig, given: PixelBox) -> Self {
+        let mut tracker = ImageTracker::new(config).unwrap_or_else(|error| panic!("{error}"));
         tracker.take_up(given);
-        Some(Self { tracker, score: TrialScore::default(), wrong_since: None })
+        Self { tracker, score: TrialScore::default(), wrong_since: None }
     }
 
     /// Follows the target into an image in which it is in a box, if that is known.
     pub(super) fn step(&mut self, image: &Plane, time: Timestamp, label: Option<PixelBox>) {
         let tracks = self.tracker.step(image, time);
         let claimed = tracks.iter().find(|track| track.id == GIVEN && is_claimed(track));
-        let Some(truth) = label.map(|label| label.centre()) else { return };
+        let Some(truth) = label.map(|label| label.centre()) else {
+            // Nobody knows what is right here.
+            self.wrong_since = None;
+            return;
+        };
         let off =
             claimed.map(|track| (track.position.x - truth.x).hypot(track.position.y - truth.y));
         self.score.labelled += 1;

@@ -31,9 +31,9 @@ pub enum ReferenceStrategy {
     /// `least_share` for the new one; each image counts as much as it is certain to show the
     /// target. The default.
     Mean {
-        /// Least weight of a new image, 0 to 1, whatever their rate: as many images must be averaged
-        /// for noise to be small. (With the mean over 1.1 s, eleven images at ten a second, a tenth
-        /// more frames of small targets are lost there.) Default 0.03.
+        /// Least weight of a new image, 0 to 1, whatever their rate: as many images must be
+        /// averaged for noise to be small. (With the mean over 1.1 s, eleven images at ten a
+        /// second, a tenth more frames of small targets are lost there.) Default 0.03.
         least_share: f32,
     },
 }

@@ -19,13 +19,14 @@ pub(super) fn tables(
     clips: Option<&Path>,
     mut progress: impl FnMut(usize, usize, &str),
 ) -> anyhow::Result<Vec<Table>> {
+    // The videos first: what is wrong with one is said before the drawn scenes have taken minutes.
     let videos = clips.map_or(Ok(Vec::new()), labelled_videos)?;
-    let mut tables = ablate_drawn(options, &TrackerPart::ALL, &mut progress);
     let mut ablation = ClipAblation::default();
     for (done, video) in videos.iter().enumerate() {
         progress(done, videos.len(), &video.display().to_string());
         ablation.take(follow(video)?);
     }
+    let mut tables = ablate_drawn(options, &TrackerPart::ALL, &mut progress);
     if !videos.is_empty() {
         tables.extend(ablation.tables());
     }
@@ -69,5 +70,6 @@ fn follow(video: &Path) -> anyhow::Result<ClipTrials> {
         }
     }
     repeats.remind(Instant::now());
+    ensure!(trials.has_begun(), "no frame of {} has a label", video.display());
     Ok(trials)
 }

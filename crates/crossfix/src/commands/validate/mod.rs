@@ -27,14 +27,13 @@ enum What {
     ///
     /// Prints each figure with the paper's, ours, the Monte Carlo standard error and, where
     /// something is asked of it, pass or fail.
-    #[command(
-        after_help = "Examples:\n  crossfix validate tracker --runs 1000 --json tracker.json --plots plots\n  \
-                      crossfix validate tracker --ablate --clips videos"
-    )]
     ///
     /// With --ablate: what each part of the tracker brings. The share of frames that are lost with
     /// all parts, and how much more is lost without each, on drawn scenes (noise, masts, wires,
     /// birds, clouds' edges, a pan) and on labelled videos.
+    #[command(after_help = "Examples:\n  \
+                      crossfix validate tracker --runs 1000 --json tracker.json --plots plots\n  \
+                      crossfix validate tracker --ablate --clips videos")]
     Tracker(TrackerOptions),
     /// The fusion: detection, degenerate geometries, the Cramer-Rao bound, manoeuvres (Klochko
     /// 2020, Kalinov 2019).
@@ -51,8 +50,9 @@ enum What {
 struct TrackerOptions {
     #[command(flatten)]
     options: Options,
-    /// Print what each part of the tracker brings instead of the papers' tables.
-    #[arg(long, conflicts_with = "only")]
+    /// Print what each part of the tracker brings instead of the papers' tables; --runs is then the
+    /// number of scenes of each kind, 10 by default.
+    #[arg(long, conflicts_with_all = ["only", "strict"])]
     ablate: bool,
     /// A folder of videos, each with a table of the same name (CSV: frame,x,y,w,h) that says where
     /// its one target is.
@@ -62,8 +62,7 @@ struct TrackerOptions {
 
 #[derive(Debug, clap::Args)]
 struct Options {
-    /// Monte Carlo runs of an experiment; the papers have 1000. Default 200; with --ablate, 10
-    /// scenes of each kind.
+    /// Monte Carlo runs of an experiment; the papers have 1000. Default: 200.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=1_000_000))]
     runs: Option<u32>,
     /// Seed of everything random.
