@@ -7,6 +7,7 @@
 )]
 
 use std::path::Path;
+use std::process::Output;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -142,6 +143,75 @@ fn files_of(folder: &Path) -> Vec<std::path::PathBuf> {
     std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect()
 }
 
+/// A command that is asked to stop half a second after it began to listen for that, and how long it
+/// took from then on.
+fn terminated(arguments: &[&str]) -> (Output, Duration) {
+    let command = std::process::Command::new(crossfix_tests::program())
+        .args(arguments)
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    wait_until_it_listens(command.id());
+    std::thread::sleep(Duration::from_millis(500));
+    let pid = command.id().to_string();
+    std::process::Command::new("kill").args(["-TERM", &pid]).status().unwrap();
+    let asked = Instant::now();
+    (command.wait_with_output().unwrap(), asked.elapsed())
+}
+
+/// Waits until the process has a handler for SIGTERM, signal 15, as Linux tells.
+fn wait_until_it_listens(pid: u32) {
+    let deadline = Instant::now() + Duration::from_secs(30);
+    loop {
+        let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).unwrap();
+        if u64::from_str_radix(caught.trim(), 16).unwrap() & 1 << 14 != 0 {
+            return;
+        }
+        assert!(Instant::now() < deadline, "it does not listen for SIGTERM");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn a_tracker_that_is_asked_to_stop_keeps_the_rows_so_far() {
+    let folder = tempfile::tempdir().unwrap();
+    let video = folder.path().join("video");
+    std::fs::create_dir(&video).unwrap();
+    let picture = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/demo.png");
+    for frame in 0..5000 {
+        std::os::unix::fs::symlink(picture, video.join(format!("{frame:05}.png"))).unwrap();
+    }
+    let [video, table] = ["video", "rows.csv"].map(|name| folder.path().join(name));
+    let [video_name, table_name] = [&video, &table].map(|path| path.to_str().unwrap());
+    let (ended, took) =
+        terminated(&["track", video_name, "--box", "100,100,20,20", "--csv", table_name]);
+    let said = String::from_utf8_lossy(&ended.stderr).into_owned();
+    assert!(took < LIMIT && ended.status.success(), "{took:?}: {said}");
+    let rows = std::fs::read_to_string(&table).unwrap();
+    assert!((2..4000).contains(&rows.lines().count()) && rows.ends_with('\n'), "{rows}");
+    let mut left = files_of(folder.path());
+    left.sort();
+    assert_eq!(left, [table, video]);
+}
+
+/// One that waits for the system and cannot look whether it is asked to stop.
+#[test]
+fn a_command_that_hangs_ends_when_it_is_asked_to_and_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let [silent, table] = ["silent.mcap", "rows.csv"].map(|name| folder.path().join(name));
+    // Nobody will ever write to this pipe.
+    assert!(std::process::Command::new("mkfifo").arg(&silent).status().unwrap().success());
+    let [silent_name, table_name] = [&silent, &table].map(|path| path.to_str().unwrap());
+    let (ended, took) = terminated(&["export", silent_name, "--csv", table_name]);
+    let said = String::from_utf8_lossy(&ended.stderr).into_owned();
+    assert!(took < LIMIT, "{took:?}");
+    assert_eq!(ended.status.code(), Some(1), "{said}");
+    assert!(said.contains("asked to stop"), "{said}");
+    assert_eq!(files_of(folder.path()), [silent]);
+}
+
 #[test]
 fn a_simulation_that_is_asked_to_stop_leaves_no_half_files() {
     let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/demo/scene.toml");
@@ -156,19 +226,10 @@ fn a_simulation_that_is_asked_to_stop_leaves_no_half_files() {
         if to == "-o" {
             output.push("a.mcap");
         }
-        let simulation = std::process::Command::new(crossfix_tests::program())
-            .args(source)
-            .arg(to)
-            .arg(output)
-            .stderr(std::process::Stdio::piped())
-            .spawn()
-            .unwrap();
-        std::thread::sleep(Duration::from_millis(500));
-        let pid = simulation.id().to_string();
-        std::process::Command::new("kill").args(["-TERM", &pid]).status().unwrap();
-        let asked = Instant::now();
-        let ended = simulation.wait_with_output().unwrap();
-        assert!(asked.elapsed() < LIMIT, "{to}: {:?}", asked.elapsed());
+        let output = output.to_str().unwrap().to_owned();
+        let arguments: Vec<&str> = source.iter().copied().chain([to, &output]).collect();
+        let (ended, took) = terminated(&arguments);
+        assert!(took < LIMIT, "{to}: {took:?}");
         let said = String::from_utf8_lossy(&ended.stderr).into_owned();
         assert_eq!(ended.status.code(), Some(1), "{to}: {said}");
         assert!(said.contains("asked to stop"), "{to}: {said}");

@@ -221,6 +221,20 @@ impl Centre {
         outputs
     }
 
+    /// Logs that a camera is left out, or used again.
+    fn report_camera(&mut self, camera: &CameraName, standing: Standing) {
+        if standing == Standing::Excluded {
+            self.repeats.warn(&format!("left out {camera}"), Instant::now(), || {
+                format!(
+                    "camera `{camera}` is left out: its bearings do not fit the tracks that the \
+                     others hold; check its pose and its clock"
+                )
+            });
+        } else {
+            tracing::info!("camera `{camera}` is used again: its bearings fit the tracks");
+        }
+    }
+
     /// Counts the fusion's outputs, and logs those that are meant for people.
     fn follow(&mut self, outputs: Vec<Output>) -> Vec<Output> {
         for output in &outputs {
@@ -230,7 +244,7 @@ impl Centre {
                     let kind = format!("{} {}", rejection.camera, rejection.reason.counter());
                     self.repeats.warn(&kind, Instant::now(), || format!("not used: {rejection}"));
                 }
-                Output::Camera(camera, standing) => report_camera(camera, *standing),
+                Output::Camera(camera, standing) => self.report_camera(camera, *standing),
                 Output::Event(_) | Output::Smoothed(_) | Output::Cues(_) => {}
             }
         }
@@ -310,17 +324,6 @@ impl Centre {
             tracks: self.fusion.tracks().count().try_into().unwrap_or(u32::MAX),
             ..Default::default()
         }
-    }
-}
-
-/// Logs that a camera is left out, or used again.
-fn report_camera(camera: &CameraName, standing: Standing) {
-    if standing == Standing::Excluded {
-        tracing::warn!(
-            "camera `{camera}` is left out: its bearings do not fit the tracks that the others hold; check its pose and its clock"
-        );
-    } else {
-        tracing::info!("camera `{camera}` is used again: its bearings fit the tracks");
     }
 }
 

@@ -44,7 +44,7 @@ mod shutdown;
 
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{CommandFactory, FromArgMatches, Parser};
 
 use crate::commands::Command;
 
@@ -71,7 +71,8 @@ fn main() -> ExitCode {
     network::give_zenoh_threads();
     // clap handles wrong arguments itself, with exit code 2; contradictions that it cannot see end
     // with 2, too.
-    let cli = Cli::parse();
+    let matches = takes_negative_numbers(Cli::command()).get_matches();
+    let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
     logging::start(&cli.logging);
     match shutdown::supervise(move || cli.command.run()) {
         Ok(()) => ExitCode::SUCCESS,
@@ -80,4 +81,14 @@ fn main() -> ExitCode {
             if error.is::<output::Misuse>() { ExitCode::from(2) } else { ExitCode::FAILURE }
         }
     }
+}
+
+/// The command with options that take negative numbers: one that nobody can mean is refused with its
+/// range, and not taken for an option.
+fn takes_negative_numbers(command: clap::Command) -> clap::Command {
+    let options = command.mut_args(|argument| {
+        let takes = argument.get_action().takes_values() && !argument.is_positional();
+        if takes { argument.allow_negative_numbers(true) } else { argument }
+    });
+    options.mut_subcommands(takes_negative_numbers)
 }

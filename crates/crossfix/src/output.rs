@@ -1,7 +1,9 @@
 //! What people and programs read: results on stdout, the last error on stderr.
 
+use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use anyhow::{Context, ensure};
 use serde::Serialize;
@@ -31,6 +33,21 @@ pub fn error(error: &anyhow::Error) {
     }
 }
 
+/// The temporary files that are there now: the process ends without their owners where it is told
+/// to stop and a command does not look.
+static DRAFTS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+
+/// Removes the files that are not complete; the program is about to end.
+pub fn remove_drafts() {
+    for part in std::mem::take(&mut *drafts()) {
+        let _ = std::fs::remove_file(part);
+    }
+}
+
+fn drafts() -> MutexGuard<'static, BTreeSet<PathBuf>> {
+    DRAFTS.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// A file that is being written. It has a temporary name until it is complete, so that an existing
 /// file of the wanted name stays until then, and nobody takes half a file for a whole one.
 #[derive(Debug)]
@@ -56,7 +73,9 @@ impl Draft {
         let path = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         let mut part = path.clone().into_os_string();
         part.push(format!(".{}.part", std::process::id()));
-        Ok(Self { path, part: (!in_place).then(|| part.into()) })
+        let part: Option<PathBuf> = (!in_place).then(|| part.into());
+        drafts().extend(part.clone());
+        Ok(Self { path, part })
     }
 
     /// The path to write to.
@@ -67,6 +86,7 @@ impl Draft {
     /// Moves the completed file to its final name.
     pub fn keep(mut self) -> anyhow::Result<()> {
         if let Some(part) = self.part.take() {
+            drafts().remove(&part);
             std::fs::rename(&part, &self.path)
                 .with_context(|| format!("cannot write {}", self.path.display()))?;
         }
@@ -77,6 +97,7 @@ impl Draft {
 impl Drop for Draft {
     fn drop(&mut self) {
         if let Some(part) = &self.part {
+            drafts().remove(part);
             let _ = std::fs::remove_file(part);
         }
     }

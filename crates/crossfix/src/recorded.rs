@@ -64,6 +64,19 @@ impl Lacks {
     }
 }
 
+/// Refuses a recording of whose messages none can be read, and says how many cannot.
+pub fn ensure_readable(path: &Path, messages: u64, newer: u64) -> anyhow::Result<()> {
+    let path = path.display();
+    ensure!(
+        newer == 0 || newer < messages,
+        "none of {messages} messages of {path} can be read: they are of a newer version"
+    );
+    if newer > 0 {
+        tracing::warn!("{newer} of {messages} messages of {path} are of a newer version");
+    }
+    Ok(())
+}
+
 /// Passes every message of a recording to `handle`, and adds damage to `lacks`.
 pub fn for_each(
     path: &Path,

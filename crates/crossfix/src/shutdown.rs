@@ -11,6 +11,8 @@ use anyhow::{Context, bail};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
+use crate::output;
+
 /// How long a command may take to end after it was asked to stop: people wait for it. By itself it
 /// takes [`LAST_WORDS`] plus half a second to leave the network. With half of it commands would be
 /// abandoned before they have left the network.
@@ -44,6 +46,8 @@ struct Asked {
     /// Request to read the configuration again, and whether the command can do that.
     reload: AtomicBool,
     can_reload: AtomicBool,
+    /// Whether the command looks whether it has been asked to stop.
+    is_heeded: AtomicBool,
 }
 
 /// Tells whether the program has been asked to stop, or to read its configuration again.
@@ -51,8 +55,16 @@ struct Asked {
 pub struct Shutdown(Arc<Asked>);
 
 impl Shutdown {
-    /// Listens for Ctrl-C, SIGTERM and SIGHUP; a second signal ends the program at once.
+    /// For a command that ends by itself when it is asked to stop. Others are ended by
+    /// [`supervise`].
     pub fn listen() -> Self {
+        let shutdown = Self::begin();
+        shutdown.0.is_heeded.store(true, Ordering::SeqCst);
+        shutdown
+    }
+
+    /// Listens for Ctrl-C, SIGTERM and SIGHUP; a second signal ends the program at once.
+    fn begin() -> Self {
         let asked = ASKED.get_or_init(|| {
             let asked = Arc::new(Asked::default());
             let heard = Arc::clone(&asked);
@@ -122,10 +134,12 @@ fn heed(mut signals: Signals, asked: &Asked) {
 }
 
 /// Runs a command, and abandons it if it does not end in time after a request to stop, so that a
-/// hanging disk or a long computation cannot keep the process alive.
+/// hanging disk or a long computation cannot keep the process alive. One that does not look whether
+/// it is asked to stop is abandoned at once, and what it was writing is removed.
 pub fn supervise(
     command: impl FnOnce() -> anyhow::Result<()> + Send + 'static,
 ) -> anyhow::Result<()> {
+    let Shutdown(asked) = Shutdown::begin();
     let (done, result) = channel();
     let worker = std::thread::Builder::new()
         .stack_size(STACK_BYTES)
@@ -142,11 +156,14 @@ pub fn supervise(
                 bail!("the command ended without a result");
             }
         }
-        let asked = ASKED.get().and_then(|asked| asked.stop.get());
-        if asked.is_some_and(|asked| asked.elapsed() > GRACE) {
-            bail!(
-                "it was busy and did not end within 2 s: ended without it; what it was writing is not complete"
-            );
+        let Some(since) = asked.stop.get() else { continue };
+        if !asked.is_heeded.load(Ordering::SeqCst) {
+            output::remove_drafts();
+            bail!("asked to stop: what was not complete is removed");
+        }
+        if since.elapsed() > GRACE {
+            output::remove_drafts();
+            bail!("it was busy and did not end within 2 s: what was not complete is removed");
         }
     }
 }

@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
+use std::collections::BTreeSet;
+
 use assert_cmd::Command;
 
 const COMMANDS: [&str; 23] = [
@@ -62,6 +64,7 @@ fn all_commands() -> Vec<Vec<String>> {
 /// The help of a command in a terminal that is wider than the help may be.
 fn help_of(command: &[String]) -> String {
     let output = crossfix().args(command).arg("--help").env("COLUMNS", "200").output().unwrap();
+    assert!(output.status.success(), "{command:?} --help: {output:?}");
     String::from_utf8(output.stdout).unwrap()
 }
 
@@ -88,9 +91,11 @@ fn no_help_is_wider_than_100_columns() {
 /// An example is copied into a shell: where it goes on in another line, it says so.
 #[test]
 fn a_long_example_is_broken_as_a_shell_needs_it() {
+    let mut with_examples = 0;
     for command in all_commands() {
         let help = help_of(&command);
         let Some((_, examples)) = help.split_once("\nExample") else { continue };
+        with_examples += 1;
         let mut goes_on = false;
         for line in examples.lines().skip(1).filter(|line| !line.is_empty()) {
             assert_eq!(goes_on, !line.starts_with("  crossfix "), "{command:?} --help: {line}");
@@ -98,6 +103,26 @@ fn a_long_example_is_broken_as_a_shell_needs_it() {
         }
         assert!(!goes_on, "{command:?} --help ends with a backslash");
     }
+    assert!(with_examples >= COMMANDS.len(), "{with_examples} helps have examples");
+}
+
+/// Two usages are written by hand, as clap breaks no long line of them.
+#[test]
+fn a_usage_that_is_written_by_hand_names_what_must_be_given() {
+    for command in [&["export"][..], &["import", "drone-tracking-datasets"]] {
+        let said = crossfix().args(command).output().unwrap();
+        assert_eq!(said.status.code(), Some(2));
+        let said = String::from_utf8(said.stderr).unwrap();
+        let (missing, usage) = said.split_once("Usage:").unwrap();
+        let usage = usage.split("\n\n").next().unwrap();
+        assert!(!options_in(missing).is_empty(), "{said}");
+        assert_eq!(options_in(missing), options_in(usage), "{said}");
+    }
+}
+
+fn options_in(text: &str) -> BTreeSet<&str> {
+    let words = text.split(|c: char| !c.is_ascii_alphanumeric() && c != '-');
+    words.filter(|word| word.starts_with("--")).collect()
 }
 
 #[test]

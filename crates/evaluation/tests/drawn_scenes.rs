@@ -21,7 +21,7 @@ fn targets_are_followed_and_what_is_no_target_is_not_shown_for_one() {
     // Frames lost, %; masts and clouds also hide the target. Sixteen scenes of each kind of another
     // seed lose 9, 4 and 10 % in the mean, with standard errors for four of 5, 1.3 and 6. In noise a
     // scene is lost as a whole or not at all.
-    for (kind, most) in [("noise", 60.0), ("masts", 25.0), ("wires", 10.0), ("edges", 18.0)] {
+    for (kind, most) in [("noise", 30.0), ("masts", 25.0), ("wires", 10.0), ("edges", 18.0)] {
         let all = row(&tables, &format!("ablation-{kind}"), "all parts");
         assert!(all.ours < most, "{kind}: {:.1} % of the frames are lost", all.ours);
         assert!(all.x < 1.0, "{kind}: something else is shown for {:.1} s", all.x);

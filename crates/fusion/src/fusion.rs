@@ -358,8 +358,7 @@ impl Fusion {
     }
 
     /// Updates the tracks with an exposure, and gives what they leave over to the search for new
-    /// tracks; returns how the exposure fits the tracks, and which track has used which
-    /// sighting.
+    /// tracks; returns how the exposure fits the tracks, and which track has used which sighting.
     fn follow(
         &mut self,
         exposure: &Exposure,

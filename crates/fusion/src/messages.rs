@@ -40,7 +40,6 @@ pub(crate) fn track(
         angle_rad: residual.angle,
         nis: residual.nis,
     });
-
     let mut told = crossfix_message::Track {
         id: track.id.0,
         state: state.into(),

@@ -5,9 +5,9 @@ use std::f64::consts::PI;
 
 use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, MotionModels};
 use crossfix_geometry::{BearingModel, SightLine};
-use nalgebra::{Matrix2, Matrix2x3, Matrix3x2, Point3, Vector2};
+use nalgebra::{Matrix2, Matrix3x2, Point3, Vector2};
 
-use crate::uncertainty::{CameraUncertainty, SharedErrors, Shifts};
+use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
 /// The predicted bearing of a target for one camera, with its covariance.
 #[derive(Clone, Debug)]
@@ -43,24 +43,6 @@ struct Spread {
     /// its covariance with the track's own error of direction.
     shift: Matrix2<f64>,
     cross: Matrix2<f64>,
-}
-
-impl Spread {
-    /// By a camera's errors, with J (`shifts`) and H (`by`) as the Jacobians of the bearing by them
-    /// and by the place, H P H' (`placed`), and the noise of the clock.
-    fn of(
-        errors: &SharedErrors,
-        shifts: &Shifts,
-        by: &Matrix2x3<f64>,
-        placed: &Matrix2<f64>,
-        clock: &Matrix2<f64>,
-    ) -> Self {
-        let shift = errors.spread(shifts);
-        // H X J', with X the track's covariance with the shared errors.
-        let cross = by * errors.ties.fixed_rows::<3>(0) * shifts.transpose();
-        let steady = placed + cross + cross.transpose() + shift + clock;
-        Self { shifted: shifts * errors.mean, steady, shift, cross }
-    }
 }
 
 /// One of the lines that a track was started from, compared with that track; along the tangents.
@@ -141,7 +123,13 @@ impl BearingPrediction {
         let clock = uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
         // H P H', with H = E' / r.
         let placed = by * state.position_covariance() * by.transpose();
-        let spread = |errors: &SharedErrors| Spread::of(errors, &shifts, &by, &placed, &clock);
+        let spread = |errors: &SharedErrors| {
+            let shift = errors.spread(&shifts);
+            // H X J', with X the track's covariance with the shared errors.
+            let cross = by * errors.ties.fixed_rows::<3>(0) * shifts.transpose();
+            let steady = placed + cross + cross.transpose() + shift + clock;
+            Spread { shifted: shifts * errors.mean, steady, shift, cross }
+        };
         // White acceleration of density q moves a position by a variance of q t^3 / 3.
         let moved = interval.abs().powi(3) / 3.0 / model.range.powi(2);
         let mut added = [0.0; MAX_MODELS];

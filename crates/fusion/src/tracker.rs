@@ -68,7 +68,8 @@ struct Noted {
 /// A sighting that a track has used.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct UsedSighting {
-    /// Its index in the exposure.
+    /// Its index: among the exposure's sightings where tracks have used it, among the free ones where
+    /// they claim it.
     pub(crate) index: usize,
     pub(crate) track: TrackId,
 }

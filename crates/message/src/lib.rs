@@ -31,7 +31,7 @@ pub use glance::{Glance, glance};
 pub use key::{Channel, Key, KeyError};
 pub use name::{AreaName, CameraName, NameError, SiteName};
 pub use payload::{DecodeError, Payload, decode, file_descriptor_set};
-pub use size::{MAX_DECODED_BYTES, MAX_MESSAGE_BYTES, Repeated};
+pub use size::{MOST_DECODED_BYTES, MOST_MESSAGE_BYTES, Repeated};
 pub use time::Timestamp;
 pub use track::{TrackNumber, renumbered, track_id};
 pub use wire::*;

@@ -1,7 +1,7 @@
 use prost::Message;
 use thiserror::Error;
 
-use crate::size::{self, MAX_DECODED_BYTES, Repeated};
+use crate::size::{self, MOST_DECODED_BYTES, Repeated};
 use crate::{
     BearingFrame, CameraCalibration, CueFrame, Health, Preview, TrackEvent, TrackFrame, TruthFrame,
     VERSION, Version,
@@ -93,7 +93,7 @@ pub enum DecodeError {
     },
     /// The message would take more memory than any real one.
     #[error(
-        "a {schema} of {wire_bytes} bytes would take more than {MAX_DECODED_BYTES} bytes of memory"
+        "a {schema} of {wire_bytes} bytes would take more than {MOST_DECODED_BYTES} bytes of memory"
     )]
     TooLarge {
         /// The message that was expected.
@@ -114,14 +114,14 @@ pub enum DecodeError {
 }
 
 /// Decodes a message from the bytes of wire or recording. The memory that it would take is computed
-/// before it is decoded: at most [`MAX_DECODED_BYTES`], and twice that while it is read.
+/// before it is decoded: at most [`MOST_DECODED_BYTES`], and twice that while it is read.
 ///
 /// # Errors
 /// [`DecodeError`] if the bytes are no such message, too large, or of a newer major version.
 pub fn decode<M: Payload>(bytes: &[u8]) -> Result<M, DecodeError> {
     let malformed = |source| DecodeError::Malformed { schema: M::SCHEMA, source };
-    let decoded = size::decoded_bytes(bytes, M::LISTS, MAX_DECODED_BYTES).map_err(malformed)?;
-    if decoded > MAX_DECODED_BYTES {
+    let decoded = size::decoded_bytes(bytes, M::LISTS, MOST_DECODED_BYTES).map_err(malformed)?;
+    if decoded > MOST_DECODED_BYTES {
         return Err(DecodeError::TooLarge { schema: M::SCHEMA, wire_bytes: bytes.len() });
     }
     let message = M::of_bytes(bytes).map_err(malformed)?;

@@ -10,12 +10,12 @@ use crate::{
 /// The longest message that is accepted or recorded, bytes. The largest real ones are previews
 /// (about 100 kB) and frames of a thousand tracks (about 1 MB). With half of it frames of four
 /// thousand tracks still pass.
-pub const MAX_MESSAGE_BYTES: usize = 8 << 20;
+pub const MOST_MESSAGE_BYTES: usize = 8 << 20;
 
 /// The most memory that a decoded message may take, bytes: 80 000 bearings. Lists double as they
 /// grow, so that decoding one takes twice as much for a moment. With half of it a frame of 40 000
 /// bearings still passes; with twice as much one hostile message takes 64 MB.
-pub const MAX_DECODED_BYTES: usize = 16 << 20;
+pub const MOST_DECODED_BYTES: usize = 16 << 20;
 
 /// A list in a message that may be larger in memory than on the wire: an empty element has two
 /// bytes on the wire and its whole size in memory.
@@ -164,7 +164,7 @@ mod tests {
 
     #[test]
     fn what_says_nothing_many_times_is_refused_before_it_is_decoded() {
-        let empty_bearings = [0x42, 0x00].repeat(MAX_MESSAGE_BYTES / 2);
+        let empty_bearings = [0x42, 0x00].repeat(MOST_MESSAGE_BYTES / 2);
         let refused = decode::<BearingFrame>(&empty_bearings);
         assert!(matches!(refused, Err(crate::DecodeError::TooLarge { .. })), "{refused:?}");
         // One track with very many empty residuals.

@@ -3,7 +3,7 @@ use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Seek, Write};
 use std::path::Path;
 
-use crossfix_message::{Key, MAX_MESSAGE_BYTES, Timestamp, file_descriptor_set};
+use crossfix_message::{Key, MOST_MESSAGE_BYTES, Timestamp, file_descriptor_set};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, McapResult, WriteOptions, Writer};
 
@@ -102,7 +102,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
     /// [`RecordingError::TooLong`]: the message is left out; [`RecordingError::Write`]: nothing can
     /// be written any more.
     pub fn write(&mut self, entry: &Entry) -> Result<(), RecordingError> {
-        if entry.data.len() > MAX_MESSAGE_BYTES {
+        if entry.data.len() > MOST_MESSAGE_BYTES {
             return Err(RecordingError::TooLong {
                 topic: entry.key.to_string(),
                 bytes: entry.data.len(),

@@ -5,7 +5,9 @@ use std::convert::Infallible;
 use std::io::{self, Cursor, Seek, SeekFrom, Write};
 use std::path::Path;
 
-use crossfix_message::{BearingFrame, Channel, Key, MAX_MESSAGE_BYTES, Payload, Timestamp, decode};
+use crossfix_message::{
+    BearingFrame, Channel, Key, MOST_MESSAGE_BYTES, Payload, Timestamp, decode,
+};
 use crossfix_recording::{
     Entry, ReadFailure, ReadReport, RecordingError, RecordingReader, RecordingWriter, Source,
 };
@@ -157,9 +159,9 @@ fn a_message_that_no_reader_takes_is_not_written() {
     let mut bytes = Cursor::new(Vec::new());
     let mut writer = RecordingWriter::new(&mut bytes).unwrap();
     writer.write(&entry(0)).unwrap();
-    let long = Entry { data: vec![0; MAX_MESSAGE_BYTES + 1], ..entry(1) };
+    let long = Entry { data: vec![0; MOST_MESSAGE_BYTES + 1], ..entry(1) };
     assert!(matches!(writer.write(&long), Err(RecordingError::TooLong { .. })));
-    let longest = Entry { data: vec![7; MAX_MESSAGE_BYTES], ..entry(2) };
+    let longest = Entry { data: vec![7; MOST_MESSAGE_BYTES], ..entry(2) };
     writer.write(&longest).unwrap();
     writer.write(&entry(3)).unwrap();
     writer.finish().unwrap();

@@ -79,7 +79,7 @@ const MOST_BEATS: f64 = 80.0;
 /// them a wire's corners show in an image of 640 columns.
 const PIECES: u32 = 24;
 /// Thickness of a bird's wing, as a share of its span. With half of it a bird of ten pixels has
-/// wings of half a pixel, and hardly shows.
+/// wings of 0.7 px, and hardly shows.
 const WING: f64 = 0.14;
 /// Largest angle of a wing above and below the horizontal, rad. With half of it a bird's outline
 /// changes by a third as it beats its wings, instead of two thirds.

@@ -1,5 +1,5 @@
-//! Drawing a target into an image: a dark silhouette with soft edges, smeared
-//! along its motion during the exposure.
+//! Drawing into an image: targets, dark silhouettes with soft edges that are smeared along their
+//! motion during the exposure; and clutter, strips and discs of one brightness.
 
 /// Difference of brightness between the sky and a target, 8-bit levels. With half of it targets are
 /// no darker than clouds may be, 43 levels; twice as much is more than the darkest sky has.

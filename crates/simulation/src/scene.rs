@@ -100,7 +100,8 @@ pub enum SceneError {
     /// A thing beside the targets with impossible numbers.
     #[error(
         "thing {index} of the clutter has a size that is not positive, a place or size beyond \
-         1000 km, more than 80 beats a second, or a brightness outside 0 to 255 levels"
+         1000 km, more than 80 beats a second, an impossible path, or a brightness outside 0 to \
+         255 levels"
     )]
     Clutter {
         /// Its place in the list, from 0.
@@ -160,7 +161,7 @@ impl Scene {
 
     fn check(&self) -> Result<(), SceneError> {
         let lasts = self.duration_s;
-        number(
+        check_number(
             "duration_s".into(),
             lasts,
             is_positive(lasts) && lasts < 1e5,
@@ -187,35 +188,40 @@ impl Scene {
 impl SceneTarget {
     fn check(&self) -> Result<(), SceneError> {
         let span = format!("span_m of target {}", self.id);
-        number(span, self.span_m, is_positive(self.span_m), "a positive number of metres")?;
+        check_number(span, self.span_m, is_positive(self.span_m), "a positive number of metres")?;
         if self.path.is_possible() { Ok(()) } else { Err(SceneError::Path { target: self.id }) }
     }
 }
 
 impl SceneCamera {
     fn check(&self) -> Result<(), SceneError> {
-        self.in_range("rate_hz", self.rate_hz, 0.01..=1000.0, "from 0.01 to 1000 frames a second")?;
-        self.in_range("noise_levels", self.noise_levels, 0.0..=100.0, "from 0 to 100 levels")?;
-        self.in_range("blur_px", self.blur_px, 0.0..=20.0, "from 0 to 20 px")?;
-        self.in_range("exposure_s", self.exposure_s, 0.0..=1.0, "from 0 to 1 s")?;
+        self.check_range(
+            "rate_hz",
+            self.rate_hz,
+            0.01..=1000.0,
+            "from 0.01 to 1000 frames a second",
+        )?;
+        self.check_range("noise_levels", self.noise_levels, 0.0..=100.0, "from 0 to 100 levels")?;
+        self.check_range("blur_px", self.blur_px, 0.0..=20.0, "from 0 to 20 px")?;
+        self.check_range("exposure_s", self.exposure_s, 0.0..=1.0, "from 0 to 1 s")?;
         if let Some(SceneMount { rate_deg_per_s: rate, angle_sd_mrad: sd, .. }) = self.mount {
             let turns = "from 0.01 to 1000 degrees a second";
-            self.in_range("mount.rate_deg_per_s", rate, 0.01..=1000.0, turns)?;
-            self.in_range("mount.angle_sd_mrad", sd, 0.0..=100.0, "from 0 to 100 mrad")?;
+            self.check_range("mount.rate_deg_per_s", rate, 0.01..=1000.0, turns)?;
+            self.check_range("mount.angle_sd_mrad", sd, 0.0..=100.0, "from 0 to 100 mrad")?;
         }
         let most = self.size_px.iter().copied().max().unwrap_or(0);
-        self.in_range("size_px", f64::from(most), 0.0..=8192.0, "at most 8192 px")
+        self.check_range("size_px", f64::from(most), 0.0..=8192.0, "at most 8192 px")
     }
 
     /// An error where a number of it is not in its range.
-    fn in_range(
+    fn check_range(
         &self,
         key: &str,
         value: f64,
         range: RangeInclusive<f64>,
         must: &'static str,
     ) -> Result<(), SceneError> {
-        in_range(format!("{key} of camera {}", self.name), value, range, must)
+        check_range(format!("{key} of camera {}", self.name), value, range, must)
     }
 }
 
@@ -224,16 +230,21 @@ fn is_positive(value: f64) -> bool {
 }
 
 /// An error where a number is not in its range.
-pub(crate) fn in_range(
+pub(crate) fn check_range(
     what: impl Into<String>,
     value: f64,
     range: RangeInclusive<f64>,
     must: &'static str,
 ) -> Result<(), SceneError> {
-    number(what.into(), value, range.contains(&value), must)
+    check_number(what.into(), value, range.contains(&value), must)
 }
 
 /// An error where a number is not good.
-fn number(what: String, value: f64, good: bool, must: &'static str) -> Result<(), SceneError> {
+fn check_number(
+    what: String,
+    value: f64,
+    good: bool,
+    must: &'static str,
+) -> Result<(), SceneError> {
     if good { Ok(()) } else { Err(SceneError::Number { what, value, must }) }
 }

@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Poisson, StandardNormal};
 
 use crate::circuit::{Airspace, Circuit};
-use crate::scene::in_range;
+use crate::scene::check_range;
 use crate::{SceneError, TargetState};
 
 /// Track numbers per exposure: the bearings of an exposure are numbered from its sequence number
@@ -161,24 +161,29 @@ impl Site {
     }
 
     fn check(&self) -> Result<(), SceneError> {
-        in_range("duration_s", self.duration_s, 1e-3..=1e5, "from 0.001 to 100000 s")?;
+        check_range("duration_s", self.duration_s, 1e-3..=1e5, "from 0.001 to 100000 s")?;
         for side in self.area_m {
-            in_range("area_m", side, 1.0..=1e5, "from 1 to 100000 m")?;
+            check_range("area_m", side, 1.0..=1e5, "from 1 to 100000 m")?;
         }
         let [low, high] = self.heights_m;
-        in_range("heights_m", low, 0.0..=high, "from 0 to the greatest height")?;
-        in_range("heights_m", high, low..=1e4, "from the least height to 10000 m")?;
+        check_range("heights_m", low, 0.0..=high, "from 0 to the greatest height")?;
+        check_range("heights_m", high, low..=1e4, "from the least height to 10000 m")?;
         let [slow, fast] = self.speeds_mps;
-        in_range("speeds_mps", slow, 0.0..=fast, "from 0 to the greatest speed")?;
-        in_range("speeds_mps", fast, slow..=1e3, "from the least speed to 1000 m/s")?;
-        in_range("turn_rps", self.turn_rps, 0.0..=3.0, "from 0 to 3 rad/s")?;
-        in_range("targets", self.targets as f64, 0.0..=1e5, "at most 100000")?;
-        in_range("cameras", self.cameras as f64, 1.0..=999.0, "from 1 to 999")?;
-        in_range("range_m", self.range_m, 1.0..=1e5, "from 1 to 100000 m")?;
-        in_range("rate_hz", self.rate_hz, 0.01..=1000.0, "from 0.01 to 1000 exposures a second")?;
-        in_range("detection_probability", self.detection_probability, 0.0..=1.0, "from 0 to 1")?;
-        in_range("clutter", self.clutter, 0.0..=1000.0, "from 0 to 1000 an exposure")?;
-        in_range("noise_rad", self.noise_rad, 1e-7..=0.1, "from 0.0000001 to 0.1 rad")
+        check_range("speeds_mps", slow, 0.0..=fast, "from 0 to the greatest speed")?;
+        check_range("speeds_mps", fast, slow..=1e3, "from the least speed to 1000 m/s")?;
+        check_range("turn_rps", self.turn_rps, 0.0..=3.0, "from 0 to 3 rad/s")?;
+        check_range("targets", self.targets as f64, 0.0..=1e5, "at most 100000")?;
+        check_range("cameras", self.cameras as f64, 1.0..=999.0, "from 1 to 999")?;
+        check_range("range_m", self.range_m, 1.0..=1e5, "from 1 to 100000 m")?;
+        check_range(
+            "rate_hz",
+            self.rate_hz,
+            0.01..=1000.0,
+            "from 0.01 to 1000 exposures a second",
+        )?;
+        check_range("detection_probability", self.detection_probability, 0.0..=1.0, "from 0 to 1")?;
+        check_range("clutter", self.clutter, 0.0..=1000.0, "from 0 to 1000 an exposure")?;
+        check_range("noise_rad", self.noise_rad, 1e-7..=0.1, "from 0.0000001 to 0.1 rad")
     }
 
     fn camera(&self, index: usize) -> Result<SiteCamera, SceneError> {

@@ -145,8 +145,8 @@ impl SimulatedCamera {
         self.description.phase_s + index as f64 / self.description.rate_hz
     }
 
-    /// Renders a frame: sky, targets smeared by their motion, lens blur, noise. A camera on a mount
-    /// is at rest.
+    /// Renders a frame: sky, clutter, targets smeared by their motion, lens blur, noise. A camera on a
+    /// mount is at rest.
     pub fn frame(&self, index: u64) -> RenderedFrame {
         self.render(index, &self.camera, self.sky.clone())
     }
@@ -154,16 +154,19 @@ impl SimulatedCamera {
     /// Renders a frame of a camera whose mount points at `angles`; without a mount, the same as
     /// [`Self::frame`].
     pub fn frame_pointing(&self, index: u64, angles: ScanAngles) -> RenderedFrame {
-        let (Some(pan_tilt), Some(panorama)) = (&self.pan_tilt, &self.panorama) else {
-            return self.frame(index);
-        };
+        let Some(panorama) = &self.panorama else { return self.frame(index) };
         let [width, height] = self.description.size_px.map(|side| side as usize);
         // A turn to the left moves the visible part of the sky to the left, a turn upwards moves it
         // up: by focal length times angle.
         let aside = |angle: f64| -(angle * self.description.focal_px).round() as i64;
         let part = [aside(angles.azimuth), aside(angles.elevation)];
-        let camera = self.camera.posed(pan_tilt.pose(angles));
-        self.render(index, &camera, panorama.part(part, width, height))
+        self.render(index, &self.camera_pointing(angles), panorama.part(part, width, height))
+    }
+
+    /// Its model and pose while its mount points at `angles`; without a mount, as at rest.
+    pub fn camera_pointing(&self, angles: ScanAngles) -> Camera {
+        let posed = |pan_tilt: &PanTilt| self.camera.posed(pan_tilt.pose(angles));
+        self.pan_tilt.as_ref().map_or_else(|| self.camera.clone(), posed)
     }
 
     fn render(&self, index: u64, camera: &Camera, mut image: Vec<f32>) -> RenderedFrame {
@@ -189,13 +192,13 @@ impl SimulatedCamera {
         RenderedFrame { index, true_s, own_s, width, height, brightness }
     }
 
-    /// All that is before the camera at a time, the farthest first: what is nearer hides it.
+    /// All that is before the camera at a time, the farthest first: clutter hides what is behind it,
+    /// a target darkens it.
     fn in_view(&self, camera: &Camera, t: f64) -> Vec<InView> {
         let mut things: Vec<(f64, InView)> = Vec::new();
         for target in &self.targets {
-            let range = (target.path.state(t).0 - camera.pose().position()).norm();
             let appearance = self.appearance(camera, target, t);
-            things.extend(appearance.map(|appearance| (range, InView::Target(appearance))));
+            things.extend(appearance.map(|(range, target)| (range, InView::Target(target))));
         }
         let clutter = self.clutter.iter().filter_map(|thing| thing.appearance(camera, t));
         things.extend(clutter.map(|(range, thing)| (range, InView::Clutter(thing))));
@@ -203,21 +206,26 @@ impl SimulatedCamera {
         things.into_iter().map(|(_, thing)| thing).collect()
     }
 
-    /// How a target appears in the image at a time; `None` before it exists, or if it is behind the
-    /// camera.
-    fn appearance(&self, camera: &Camera, target: &SceneTarget, t: f64) -> Option<RenderedTarget> {
+    /// How a target appears in the image at a time, with its distance from the camera, m; `None`
+    /// before it exists, or if it is behind the camera.
+    fn appearance(
+        &self,
+        camera: &Camera,
+        target: &SceneTarget,
+        t: f64,
+    ) -> Option<(f64, RenderedTarget)> {
         if t < target.appears_s {
             return None;
         }
         let half = self.description.exposure_s / 2.0;
-
         let range = (target.path.state(t).0 - camera.pose().position()).norm();
-        Some(RenderedTarget {
+        let rendered = RenderedTarget {
             from: pixel_of(camera, target, t - half)?,
             to: pixel_of(camera, target, t + half)?,
             span: target.span_m * self.description.focal_px / range,
             blur: self.description.blur_px,
-        })
+        };
+        Some((range, rendered))
     }
 }
 

@@ -1,6 +1,6 @@
 //! The settings of a Zenoh session.
 
-use crossfix_message::MAX_MESSAGE_BYTES;
+use crossfix_message::MOST_MESSAGE_BYTES;
 use zenoh::Config;
 
 use crate::error::zenoh;
@@ -86,7 +86,7 @@ pub(crate) fn config(network: &NetworkConfig, role: &Role) -> Result<Config, Lin
         (queue("data_low"), PICTURE_BATCHES.to_string()),
         ("transport/link/tcp/so_sndbuf".to_owned(), SEND_BUFFER_BYTES.to_string()),
         // A message that gets longer than this is discarded before it is whole.
-        ("transport/link/rx/max_message_size".to_owned(), (2 * MAX_MESSAGE_BYTES).to_string()),
+        ("transport/link/rx/max_message_size".to_owned(), (2 * MOST_MESSAGE_BYTES).to_string()),
         ("scouting/multicast/enabled".to_owned(), "false".to_owned()),
         ("scouting/gossip/enabled".to_owned(), "false".to_owned()),
         // How long opening waits for peers that are not up yet, ms.

@@ -3,7 +3,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use crossfix_message::{Key, MAX_MESSAGE_BYTES};
+use crossfix_message::{Key, MOST_MESSAGE_BYTES};
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::{Sample, SampleKind};
 
@@ -87,7 +87,7 @@ impl Intake {
             return;
         };
         let length = sample.payload().len();
-        if length > MAX_MESSAGE_BYTES {
+        if length > MOST_MESSAGE_BYTES {
             self.counts.too_long.fetch_add(1, Ordering::Relaxed);
             return;
         }

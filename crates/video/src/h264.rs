@@ -12,7 +12,7 @@ use openh264::encoder::{
 use openh264::formats::{YUVSlices, YUVSource};
 
 use crate::annex_b::units;
-use crate::{MAX_PIXELS, Pixels};
+use crate::{MOST_PIXELS, Pixels};
 
 /// Most units whose pictures are waited for: no decoder holds back more, H.264 allows 16. With half
 /// of it every picture of a stream that holds back 16 would have its successor's time.
@@ -262,7 +262,7 @@ fn in_words(error: &openh264::Error) -> String {
 fn picture_of(picture: &DecodedYUV<'_>, time: Option<Reverse<i64>>) -> Result<Picture, String> {
     let (width, height) = picture.dimensions();
     let (stride, _, _) = picture.strides();
-    if width == 0 || height == 0 || (width * height) as u64 > MAX_PIXELS || stride < width {
+    if width == 0 || height == 0 || (width * height) as u64 > MOST_PIXELS || stride < width {
         return Err(format!("its size is {width}x{height}"));
     }
     let mut brightness = Vec::with_capacity(width * height);

@@ -83,7 +83,7 @@ use crossfix_message::Timestamp;
 /// Images of more pixels than this are refused: a damaged header must not take all memory. With
 /// half of it images of more than 33 megapixels are refused; with twice as much one of 16-bit
 /// colours may take 800 MB.
-pub const MAX_PIXELS: u64 = 1 << 26;
+pub const MOST_PIXELS: u64 = 1 << 26;
 
 /// A source of frames in the order of their capture.
 ///

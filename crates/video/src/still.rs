@@ -5,7 +5,7 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-use crate::{MAX_PIXELS, Pixels};
+use crate::{MOST_PIXELS, Pixels};
 
 /// Columns, rows and samples of a still image.
 pub type Still = (usize, usize, Pixels);
@@ -23,7 +23,7 @@ pub fn decode_still(bytes: &[u8]) -> Result<Still, String> {
 }
 
 fn check_size(width: u64, height: u64) -> Result<(), String> {
-    let fits = width > 0 && height > 0 && width.saturating_mul(height) <= MAX_PIXELS;
+    let fits = width > 0 && height > 0 && width.saturating_mul(height) <= MOST_PIXELS;
     if fits { Ok(()) } else { Err(format!("its size is {width}x{height}")) }
 }
 

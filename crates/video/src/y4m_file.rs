@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::{Frame, FrameClock, FrameSource, MAX_PIXELS, Pixels, VideoError};
+use crate::{Frame, FrameClock, FrameSource, MOST_PIXELS, Pixels, VideoError};
 
 /// The longest header line that is read, bytes. With half of it the same.
 const MOST_HEADER: u64 = 4096;
@@ -54,7 +54,7 @@ impl Y4mSource {
             return Err(damaged("it does not begin with YUV4MPEG2".to_owned()));
         }
         let (width, height) = (side(&text, 'W'), side(&text, 'H'));
-        if width == 0 || height == 0 || width.saturating_mul(height) > MAX_PIXELS {
+        if width == 0 || height == 0 || width.saturating_mul(height) > MOST_PIXELS {
             return Err(damaged(format!("its size is {width}x{height}")));
         }
         // The library does not know mono16, which is laid out as mono12.
@@ -62,7 +62,7 @@ impl Y4mSource {
         let header = text.replace("Cmono16", "Cmono12").into_bytes();
         let read = Arc::new(AtomicU64::new(0));
         let counted = Counted { file, read: Arc::clone(&read) };
-        let limits = y4m::Limits { bytes: 8 * MAX_PIXELS as usize };
+        let limits = y4m::Limits { bytes: 8 * MOST_PIXELS as usize };
         let decoder = y4m::Decoder::new_with_limits(Cursor::new(header).chain(counted), limits)
             .map_err(|error| damaged(error.to_string()))?;
         let rate = decoder.get_framerate();

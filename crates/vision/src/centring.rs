@@ -103,6 +103,7 @@ impl TargetBelief {
         // The contrast is in units of the reference's own, which has the target's size and
         // direction.
         (self.contrast, self.usual_contrast, self.contrast_variance) = (1.0, 1.0, 0.0);
+        self.usual_match = 1.0;
         self.shape_variances = CUT_OUT_SHAPE;
     }
 }

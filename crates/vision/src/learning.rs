@@ -68,12 +68,12 @@ impl TargetBelief {
             self.follow_contrast(fit.contrast, certainty, interval);
         }
         let match_now = fit.score.max(0.0) / self.correlation_in_noise();
-        let is_own = if config.has(TrackerPart::UsualMatch) {
+        let own_share = if config.has(TrackerPart::UsualMatch) {
             ramp(match_now / self.usual_match, LEARNING_MATCHES).max(LEARNT_ANYWAY)
         } else {
             1.0
         };
-        let learnt = certainty * is_own;
+        let learnt = certainty * own_share;
         if seen {
             let share = (certainty * interval / USUAL_MATCH_S).min(1.0);
             self.usual_match += share * (match_now - self.usual_match);
@@ -109,10 +109,9 @@ impl TargetBelief {
         self.usual_contrast += share * (self.contrast - self.usual_contrast);
     }
 
-    /// The correlation of a reference with the target's next image, if nothing but noise parts
-    /// them:
-    /// `sqrt(k c^2 k E / (c^2 k E + n v))`, with the reference's energy E over n pixels, of which the
-    /// share k is the target's, the target's contrast c and the image's noise v.
+    /// The correlation of a reference with the target's next image if only noise separates them:
+    /// `sqrt(k c^2 k E / (c^2 k E + n v))`, with the reference's energy E over n pixels, of which
+    /// the share k is the target's, the target's contrast c and the image's noise v.
     fn correlation_in_noise(&self) -> f64 {
         let clear = f64::from(self.appearance.clear_share());
         let own = self.contrast.powi(2) * clear * f64::from(self.appearance.energy());

@@ -147,14 +147,14 @@ pub(crate) struct SceneMemory {
     glance: RowGlance,
     /// Shift of the scene since the beginning, when the newest picture was taken, px.
     turned: [f64; 2],
-    /// Whether the camera is taken to stand still: no picture is registered.
-    stands_still: bool,
+    /// Whether no picture is registered, as if the camera never turned.
+    is_unregistered: bool,
 }
 
 impl SceneMemory {
-    /// The memory of a camera that may turn, or of one that is taken to stand still.
-    pub(crate) fn new(may_turn: bool) -> Self {
-        Self { stands_still: !may_turn, ..Self::default() }
+    /// A memory that registers no picture.
+    pub(crate) fn unregistered() -> Self {
+        Self { is_unregistered: true, ..Self::default() }
     }
 
     /// The pictures, the newest first.
@@ -204,7 +204,7 @@ impl SceneMemory {
         smooth(&mut self.coarse, &mut self.between);
         let Some((newest, others)) = self.pictures.split_first_mut() else { return };
         let before = newest.shift;
-        if !self.stands_still {
+        if !self.is_unregistered {
             newest.shift = turned(&self.coarse, &newest.coarse, before);
         }
         self.is_still =
@@ -227,8 +227,10 @@ impl SceneMemory {
             return None;
         }
         // Each picture is registered itself, so that errors do not add up from picture to picture.
-        for picture in self.pictures.iter_mut().filter(|_| !self.stands_still) {
-            picture.shift = turned(&self.coarse, &picture.coarse, picture.shift);
+        if !self.is_unregistered {
+            for picture in &mut self.pictures {
+                picture.shift = turned(&self.coarse, &picture.coarse, picture.shift);
+            }
         }
         self.turned = self.turned();
         let mut kept = if self.pictures.len() < PICTURES {

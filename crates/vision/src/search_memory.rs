@@ -67,6 +67,7 @@ struct OtherAppearance {
     appearance: Appearance,
     contrast: f64,
     usual_contrast: f64,
+    usual_match: f64,
     background: Option<Background>,
     /// Whether it is the last one, so that the first is in use.
     is_last: bool,
@@ -109,6 +110,7 @@ impl SearchMemory {
                 appearance,
                 contrast: FIRST_CONTRAST,
                 usual_contrast: FIRST_CONTRAST,
+                usual_match: 1.0,
                 background: None,
                 is_last: false,
                 is_like_the_first,
@@ -133,6 +135,7 @@ impl SearchMemory {
         std::mem::swap(&mut state.appearance, &mut other.appearance);
         std::mem::swap(&mut state.contrast, &mut other.contrast);
         std::mem::swap(&mut state.usual_contrast, &mut other.usual_contrast);
+        std::mem::swap(&mut state.usual_match, &mut other.usual_match);
         std::mem::swap(&mut self.background, &mut other.background);
         other.is_last = !other.is_last;
     }

@@ -134,12 +134,16 @@ impl ImageTracker {
     pub fn new(config: TrackerConfig) -> Result<Self, TrackerConfigError> {
         config.validate()?;
         let detector = config.detector.clone().map(Detector::new);
-        let may_turn = config.has(TrackerPart::CameraTurns);
+        let scene = if config.has(TrackerPart::CameraTurns) {
+            SceneMemory::default()
+        } else {
+            SceneMemory::unregistered()
+        };
         Ok(Self {
             config,
             scratch: Scratch::default(),
             snapshot: None,
-            scene: SceneMemory::new(may_turn),
+            scene,
             detector,
             waiting: Vec::new(),
             followed: Vec::new(),

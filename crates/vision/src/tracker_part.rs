@@ -112,8 +112,28 @@ impl TrackerConfig {
         }
     }
 
-    /// Whether a part takes part; those that are settings of the configuration are asked there.
+    /// Whether a part takes part.
     pub(crate) fn has(&self, part: TrackerPart) -> bool {
-        self.left_out != Some(part)
+        match part {
+            TrackerPart::Figure => self.box_sd_px > 0.0,
+            TrackerPart::Shape => self.follow_shape,
+            TrackerPart::LearntReference => self.reference != ReferenceStrategy::Fixed,
+            _ => self.left_out != Some(part),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_left_out_is_out_and_all_else_is_in() {
+        for part in TrackerPart::ALL {
+            let config = TrackerConfig::default().without(part);
+            for other in TrackerPart::ALL {
+                assert_eq!(config.has(other), other != part, "without {part:?}: {other:?}");
+            }
+        }
     }
 }

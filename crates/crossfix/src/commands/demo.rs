@@ -61,8 +61,7 @@ pub struct Args {
         long,
         default_value_t = 25.0,
         value_name = "SECONDS",
-        value_parser = numbers::demo_seconds,
-        allow_negative_numbers = true
+        value_parser = numbers::demo_seconds
     )]
     duration: f64,
     /// The folder to write recording, picture, configurations and logs to.

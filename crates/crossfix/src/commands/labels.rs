@@ -23,12 +23,13 @@ pub(crate) fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, PixelBox>
     for record in reader.records() {
         let record = record.with_context(context)?;
         let cells = columns.map(|column| record.get(column).unwrap_or_default().trim());
-        if cells.iter().all(|cell| !cell.is_empty()) {
+        if cells[1..].iter().any(|cell| !cell.is_empty()) {
             let label = label(cells);
             let (frame, place) = label.with_context(|| {
                 format!("{}: a row has frame,x,y,w,h = {}", path.display(), cells.join(","))
             })?;
-            labels.insert(frame, place);
+            let is_first = labels.insert(frame, place).is_none();
+            ensure!(is_first, "{}: frame {frame} has two boxes", path.display());
         }
     }
     Ok(labels)
@@ -38,7 +39,9 @@ pub(crate) fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, PixelBox>
 fn label([frame, x, y, width, height]: [&str; 5]) -> anyhow::Result<(u64, PixelBox)> {
     let place =
         PixelBox { x: x.parse()?, y: y.parse()?, width: width.parse()?, height: height.parse()? };
-    ensure!(place.is_possible(), "no target has such a box");
+    // NaN is not positive.
+    let is_box = place.width > 0.0 && place.height > 0.0 && place.centre().is_possible();
+    ensure!(is_box, "that is no box");
     Ok((frame.parse()?, place))
 }
 
@@ -58,10 +61,13 @@ mod tests {
         };
         let labels = read("0,1.5,2,10,6\n1,,,,\n2,3,4,10,6\n").unwrap();
         assert_eq!(labels.keys().copied().collect::<Vec<_>>(), [0, 2]);
-        for wrong in ["-1,1,2,10,6", "nan,1,2,10,6", "1e300,1,2,10,6", "0,1,2,-5,6", "0,nan,2,5,6"]
-        {
+        let frames = ["-1,1,2,10,6", "nan,1,2,10,6", "1e300,1,2,10,6", ",1,2,5,6"];
+        let boxes = ["0,1,2,-5,6", "0,nan,2,5,6", "0,1,2,,6"];
+        for wrong in frames.into_iter().chain(boxes) {
             let error = format!("{:#}", read(wrong).unwrap_err());
             assert!(error.contains(wrong), "{error}");
         }
+        let twice = format!("{:#}", read("3,1,2,10,6\n3,1,2,10,6\n").unwrap_err());
+        assert!(twice.contains("frame 3 has two boxes"), "{twice}");
     }
 }

@@ -54,8 +54,7 @@ pub struct Args {
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
     /// Standard deviation of a bearing in the recording, pixels per axis.
-    #[arg(long, default_value_t = 0.3, value_name = "PIXELS", value_parser = numbers::noise_pixels,
-          allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.3, value_name = "PIXELS", value_parser = numbers::noise_pixels)]
     noise_px: f64,
     /// Override a key of the scene, e.g. duration_s=10.
     #[arg(long = "set", value_name = "KEY=VALUE")]

@@ -71,8 +71,7 @@ pub struct Args {
         long,
         default_value_t = 8.0,
         value_name = "SECONDS",
-        value_parser = numbers::seconds_of_a_day,
-        allow_negative_numbers = true
+        value_parser = numbers::seconds_of_a_day
     )]
     seconds: f64,
     /// The file to write its last image to (JPEG).

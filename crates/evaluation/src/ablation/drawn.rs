@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 
 use crossfix_correlation::Plane;
-use crossfix_geometry::{Camera, ScanAngles};
+use crossfix_geometry::ScanAngles;
 use crossfix_message::Timestamp;
 use crossfix_simulation::{
     FlightPath, Scene, SceneCamera, SceneClutter, SceneMount, SceneTarget, SimulatedCamera,
@@ -13,7 +13,7 @@ use crossfix_vision::{ImagePoint, PixelBox, TrackerPart};
 use nalgebra::Point3;
 
 use super::trial::Trial;
-use super::{RunScores, configurations};
+use super::{RunScores, TrialStart, configurations};
 use crate::papers::Noise;
 
 /// A kind of scene.
@@ -90,10 +90,9 @@ const HEIGHT: f64 = 0.4;
 /// Period of the camera's pan, s. With half of it the scene moves by 12 px an image at most,
 /// instead of 6.
 const PAN_S: f64 = 3.0;
-/// By how much the box that is given lies beside the target, px, and by how much it is too large.
-/// With half of both the box needs no mend.
-const ASIDE_PX: f64 = 3.0;
-const LARGER: f64 = 1.3;
+/// How the target is given: a box beside it and too large, as an operator draws it. With half of
+/// both the box needs no mend.
+const START: TrialStart = TrialStart { aside_px: 3.0, larger: 1.3, later_s: 0.0 };
 
 /// Upright masts, bright and dark, before the target and behind it.
 fn masts(noise: &mut Noise) -> Vec<SceneClutter> {
@@ -207,9 +206,7 @@ impl DrawnRun {
             });
             let label = self.label(index, angles);
             if let Some(label) = label.filter(|_| trials.is_empty()) {
-                let mut centre = label.centre();
-                centre.x += ASIDE_PX;
-                let given = PixelBox::about(centre, LARGER * label.width, LARGER * label.height);
+                let given = START.of(label);
                 trials.extend(configurations(parts).map(|config| Trial::new(config, given)));
             }
             let time = Timestamp::from_seconds(rendered.own_s);
@@ -226,11 +223,7 @@ impl DrawnRun {
 
     /// The target's box, if its centre is in the image.
     fn label(&self, index: u64, angles: ScanAngles) -> Option<PixelBox> {
-        let at_rest = self.camera.camera();
-        let camera: Camera = match self.camera.pan_tilt() {
-            Some(pan_tilt) => at_rest.posed(pan_tilt.pose(angles)),
-            None => at_rest.clone(),
-        };
+        let camera = self.camera.camera_pointing(angles);
         let place: Point3<f64> = self.path.state(self.camera.true_time(index)).0;
         let pixel = camera.project(place).filter(|_| camera.sees(place))?;
         let span = SPAN_M * FOCAL_PX / (place - camera.pose().position()).norm();

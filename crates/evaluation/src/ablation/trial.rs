@@ -2,9 +2,9 @@
 
 use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
-use crossfix_vision::{ImageTrackId, ImageTracker, PixelBox, TrackerConfig};
-
-use super::is_claimed;
+use crossfix_vision::{
+    ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
+};
 
 /// Distance of the centres up to which a frame counts as followed, px: the limit of the project's
 /// other figures on videos. With half of it loose labels count as losses.
@@ -87,4 +87,9 @@ impl Trial {
     pub(super) fn score(self) -> TrialScore {
         self.score
     }
+}
+
+/// Whether a track claims to be on its target.
+fn is_claimed(track: &ImageTrack) -> bool {
+    track.phase != TrackPhase::Searching
 }

@@ -95,8 +95,8 @@ impl Initiator {
         }
     }
 
-    /// Handles a whole exposure, given which of its lines tracks have used, and returns
-    /// the new tracks of targets that cameras see one after another.
+    /// Handles a whole exposure, given which of its lines tracks have used, and returns the new
+    /// tracks of targets that cameras see one after another.
     pub(crate) fn hand_over(
         &mut self,
         exposure: &Exposure,

@@ -19,7 +19,7 @@ use viva_genicam::{
 use self::connection::{Connection, in_words};
 use crate::stream_clock::{HostClock, StreamClock};
 use crate::{
-    Arrival, CaptureTime, Frame, FrameSource, Losses, MAX_PIXELS, Pixels, StreamLatency, TimedBy,
+    Arrival, CaptureTime, Frame, FrameSource, Losses, MOST_PIXELS, Pixels, StreamLatency, TimedBy,
     VideoError,
 };
 
@@ -486,7 +486,7 @@ fn brightness(block: &Block) -> Result<Vec<u8>, String> {
     if block.pixel_format != PixelFormat::Mono8 {
         return Err(format!("its pixels are {} and not Mono8", block.pixel_format));
     }
-    if width == 0 || (width as u64) * (height as u64) > MAX_PIXELS {
+    if width == 0 || (width as u64) * (height as u64) > MOST_PIXELS {
         return Err(format!("{width}x{height} is no size of an image"));
     }
     let stride = width + usize::from(block.padding_x);

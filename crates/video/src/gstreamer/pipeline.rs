@@ -8,7 +8,7 @@ use gstreamer_video::{VideoFrameExt, VideoFrameRef, VideoInfo};
 
 use super::GstreamerOptions;
 use crate::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock, unix_time};
-use crate::{Arrival, Frame, FrameSource, MAX_PIXELS, Pixels, TimedBy, VideoError};
+use crate::{Arrival, Frame, FrameSource, MOST_PIXELS, Pixels, TimedBy, VideoError};
 
 /// Ends every pipeline: brightness alone, handed over as soon as it is there. The caller takes each
 /// frame at once, and what a decoder holds is limited by what it was given.
@@ -37,7 +37,7 @@ pub(super) fn brightness(sample: &Sample) -> Result<(usize, usize, Vec<u8>), Str
     let frame = VideoFrameRef::from_buffer_ref_readable(buffer, &info)
         .map_err(|_| "a frame cannot be read".to_owned())?;
     let (width, height) = (info.width() as usize, info.height() as usize);
-    if (width as u64) * (height as u64) > MAX_PIXELS {
+    if (width as u64) * (height as u64) > MOST_PIXELS {
         return Err(format!("{width}x{height} is too large"));
     }
     let rows = frame.plane_data(0).map_err(|error| error.to_string())?;

@@ -264,21 +264,21 @@ impl Samples {
                     offset = base.saturating_add_signed(i64::from(by));
                 }
                 for (done, entry) in run.samples.iter().enumerate() {
-                    let size = entry
-                        .size
-                        .or(head.default_sample_size)
-                        .or(usual.map(|u| u.default_sample_size))
-                        .unwrap_or(0);
-                    let flags = entry
-                        .flags
-                        .or(head.default_sample_flags)
-                        .or(usual.map(|u| u.default_sample_flags))
-                        .unwrap_or(0);
-                    let lasts = entry
-                        .duration
-                        .or(head.default_sample_duration)
-                        .or(usual.map(|u| u.default_sample_duration))
-                        .unwrap_or(0);
+                    let size = first_stated([
+                        entry.size,
+                        head.default_sample_size,
+                        usual.map(|u| u.default_sample_size),
+                    ]);
+                    let flags = first_stated([
+                        entry.flags,
+                        head.default_sample_flags,
+                        usual.map(|u| u.default_sample_flags),
+                    ]);
+                    let lasts = first_stated([
+                        entry.duration,
+                        head.default_sample_duration,
+                        usual.map(|u| u.default_sample_duration),
+                    ]);
                     let shift = entry.cts.map_or(0, i64::from);
                     if !self.push(offset, size, flags & IS_NOT_SYNC == 0, shift, lasts)? {
                         // What is left of the run lies beyond the end too, however many it claims.
@@ -291,4 +291,9 @@ impl Samples {
         }
         Ok(())
     }
+}
+
+/// What the first says that says anything: the sample itself, its part, or the whole track; else 0.
+fn first_stated(said: [Option<u32>; 3]) -> u32 {
+    said.into_iter().flatten().next().unwrap_or(0)
 }

@@ -25,7 +25,7 @@ struct TargetModel {
     /// Largest ratio between the scales of one thing's plots: as its parts and its shadow come and
     /// go, the next scale on either side stands out more. With 5 the plots of a bird and of its
     /// flock count as one thing's.
-    most_scales: f64,
+    most_scale_ratio: f64,
 }
 
 const TARGET: TargetModel = TargetModel {
@@ -33,7 +33,7 @@ const TARGET: TargetModel = TargetModel {
     in_gate: 0.999,
     velocity_sd_px: 120.0,
     acceleration_sd_px: 300.0,
-    most_scales: 2.5,
+    most_scale_ratio: 2.5,
 };
 
 /// How much the places of a candidate's plots may tell, as log likelihood ratios.
@@ -200,7 +200,7 @@ impl Candidate {
 
     fn may_make(&self, plot: &Plot) -> bool {
         let scales = self.plot.cell.max(plot.cell) / self.plot.cell.min(plot.cell);
-        self.plot.is_brighter == plot.is_brighter && scales <= TARGET.most_scales
+        self.plot.is_brighter == plot.is_brighter && scales <= TARGET.most_scale_ratio
     }
 
     /// Updates with a plot; `chance` is the density of clutter, 1/px^2.

@@ -46,20 +46,17 @@ pub struct Question {
     #[arg(long, value_name = "FILE")]
     pub truth: Option<PathBuf>,
     /// Farther than this from a target a track is not that target's, metres.
-    #[arg(long, default_value_t = 5.0, value_name = "METRES", value_parser = numbers::distance,
-          allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 5.0, value_name = "METRES", value_parser = numbers::distance)]
     pub cutoff_m: f64,
     /// Leave out what lies less than this after the first truth, seconds.
-    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::seconds,
-          allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::seconds)]
     pub skip_s: f64,
     /// Standard deviation of the truth's places, metres per axis: what it may be off by itself.
     #[arg(
         long,
         default_value_t = 0.0,
         value_name = "METRES",
-        value_parser = numbers::metres_or_none,
-        allow_negative_numbers = true
+        value_parser = numbers::metres_or_none
     )]
     pub truth_sd: f64,
     /// Only the instants at which so many cameras saw something: in the frame just before and in

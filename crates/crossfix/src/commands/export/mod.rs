@@ -3,7 +3,7 @@ mod others;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail, ensure};
 use crossfix_evaluation::{Estimate, TrackHistory};
 use crossfix_message::{Channel, Timestamp, TrackFrame, TrackState};
 use serde::Deserialize;
@@ -101,6 +101,10 @@ fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
         }
     }
     let rows = table.finish().with_context(cannot_write)?;
+    if let (0, Some(times)) = (rows, &args.times) {
+        bail!("no track of {} is there at a time of {}", args.recording.display(), times.display());
+    }
+    ensure!(rows > 0, "no track of {} was ever sure (see --all)", args.recording.display());
     draft.keep()?;
     output::line(format!("{rows} rows written to {}", csv.display()));
     Ok(())

@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use crossfix_geometry::Geodetic;
-use crossfix_message::{CameraCalibration, Channel, SiteName, Timestamp, TrackEvent, TrackFrame};
+use crossfix_message::{
+    CameraCalibration, Channel, SiteName, Timestamp, TrackEvent, TrackFrame, glance,
+};
 use crossfix_outlet::foxglove::{FoxgloveView, Pictures};
 use crossfix_outlet::{GeoJsonFlights, Kml, Outlet, Sapient, Situation};
 use crossfix_recording::{Entry, RecordingWriter, Source};
@@ -230,11 +232,16 @@ fn write_foxglove(
     writer.sign(&Source::of("export --foxglove"))?;
     let mut view = FoxgloveView::new(site, anchor, Pictures::Said);
     let mut lacks = Lacks::default();
+    let (mut read, mut newer) = (0, 0);
     recorded::for_each(recording, &mut lacks, |_, entry: Entry| {
+        read += 1;
+        let seen = glance(&entry.key.channel, &entry.data).ok().flatten();
+        newer += u64::from(seen.is_some_and(|seen| !seen.is_readable));
         writer.write(&entry)?;
         Ok(foxglove::write(&mut writer, &mut view, &entry)?)
     })?;
     lacks.say(recording);
+    recorded::ensure_readable(recording, read, newer)?;
     let messages = writer.finish()?;
     draft.keep()?;
     output::line(format!(

@@ -37,7 +37,7 @@ pub struct Args {
     sets: Vec<String>,
     /// Publish each state of a track once more this long after it, seconds, as the bearings since
     /// have told: on `fusion/smoothed`, beside those that go out at once.
-    #[arg(long, value_name = "SECONDS", value_parser = numbers::lag, allow_negative_numbers = true)]
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::lag)]
     lag: Option<f64>,
     #[command(flatten)]
     health: HealthArgs,

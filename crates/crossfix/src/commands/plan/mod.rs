@@ -50,59 +50,33 @@ pub struct Args {
     )]
     max: Option<[f64; 3]>,
     /// Side of a cell, metres. Default: a twelfth of the volume's longest side, made round.
-    #[arg(
-        long,
-        value_name = "METRES",
-        value_parser = numbers::distance,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "METRES", value_parser = numbers::distance)]
     step: Option<f64>,
     /// How long a target has been seen, flying straight, seconds (at most 60).
     #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = window)]
     window: f64,
     /// Standard deviation of a target's place in the image, pixels per axis. Default: what each
     /// camera's calibration has found of its labels; 0.5 without.
-    #[arg(
-        long,
-        value_name = "PIXELS",
-        value_parser = numbers::pixels,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "PIXELS", value_parser = numbers::pixels)]
     pixel_sd: Option<f64>,
     /// Standard deviation of the cameras' rotation, degrees per axis. Default: each camera's own,
     /// from its calibration or file; a careful survey's 0.057 (1 mrad) where nobody has said.
-    #[arg(
-        long,
-        value_name = "DEGREES",
-        value_parser = numbers::degrees,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "DEGREES", value_parser = numbers::degrees)]
     rotation_sd_deg: Option<f64>,
     /// Standard deviation of the cameras' positions, metres per axis. Default: each camera's own,
     /// or a careful survey's 0.05.
-    #[arg(
-        long,
-        value_name = "METRES",
-        value_parser = numbers::metres_or_none,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "METRES", value_parser = numbers::metres_or_none)]
     position_sd: Option<f64>,
     /// Standard deviation of the cameras' clocks, seconds. Default: each camera's own, from its
     /// file.
-    #[arg(
-        long,
-        value_name = "SECONDS",
-        value_parser = numbers::seconds_of_an_hour,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::seconds_of_an_hour)]
     clock_sd: Option<f64>,
     /// How fast targets fly, metres per second: what an error of a clock is worth.
     #[arg(
         long,
         default_value_t = 15.0,
         value_name = "METRES_PER_SECOND",
-        value_parser = numbers::metres_per_second,
-        allow_negative_numbers = true
+        value_parser = numbers::metres_per_second
     )]
     speed: f64,
     /// What is known of a target's velocity beforehand: standard deviation, metres per second per
@@ -111,8 +85,7 @@ pub struct Args {
         long,
         default_value_t = 15.0,
         value_name = "METRES_PER_SECOND",
-        value_parser = numbers::metres_per_second,
-        allow_negative_numbers = true
+        value_parser = numbers::metres_per_second
     )]
     velocity_prior_sd: f64,
     /// Size of the target, metres: how far it is seen; 0 is from anywhere.
@@ -120,26 +93,14 @@ pub struct Args {
         long,
         default_value_t = 0.4,
         value_name = "METRES",
-        value_parser = numbers::metres_or_none,
-        allow_negative_numbers = true
+        value_parser = numbers::metres_or_none
     )]
     target_size: f64,
     /// Pixels that the target must span to be seen.
-    #[arg(
-        long,
-        default_value_t = 6.0,
-        value_name = "PIXELS",
-        value_parser = numbers::pixels,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, default_value_t = 6.0, value_name = "PIXELS", value_parser = numbers::pixels)]
     min_pixels: f64,
     /// Farther than this nothing is seen, metres.
-    #[arg(
-        long,
-        value_name = "METRES",
-        value_parser = numbers::distance,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "METRES", value_parser = numbers::distance)]
     max_range: Option<f64>,
     /// Print JSON, with every cell and every candidate.
     #[arg(long)]

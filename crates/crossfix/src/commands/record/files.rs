@@ -32,30 +32,19 @@ const LAST_SHARE: f64 = 0.1;
 pub struct Limits {
     /// Begin a new file whenever one is so large, MB. Files are named by when they begin:
     /// today-20261125T221700Z.mcap.
-    #[arg(
-        long,
-        value_name = "MB",
-        value_parser = numbers::megabytes,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "MB", value_parser = numbers::megabytes)]
     rotate_mb: Option<f64>,
     /// Begin a new file after so many minutes.
-    #[arg(
-        long,
-        value_name = "MINUTES",
-        value_parser = numbers::minutes,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "MINUTES", value_parser = numbers::minutes)]
     rotate_min: Option<f64>,
     /// Remove the oldest of the files that are named so, also those of earlier runs, when together
     /// they take more, GB.
-    #[arg(long, value_name = "GB", value_parser = numbers::quota, allow_negative_numbers = true)]
+    #[arg(long, value_name = "GB", value_parser = numbers::quota)]
     quota_gb: Option<f64>,
     /// What is left free on the disk, GB. With less of it the oldest of these files goes; where
     /// there is none, pictures are not recorded, and with a tenth of it, nothing but bearings,
     /// calibrations and tracks.
-    #[arg(long, value_name = "GB", default_value_t = 0.5, value_parser = numbers::gigabytes,
-          allow_negative_numbers = true)]
+    #[arg(long, value_name = "GB", default_value_t = 0.5, value_parser = numbers::gigabytes)]
     leave_free_gb: f64,
 }
 
@@ -272,7 +261,15 @@ impl RecordFiles {
             return;
         }
         let folder = self.asked.parent().filter(|folder| !folder.as_os_str().is_empty());
-        let Ok(entries) = std::fs::read_dir(folder.unwrap_or(Path::new("."))) else { return };
+        let folder = folder.unwrap_or(Path::new("."));
+        let entries = match std::fs::read_dir(folder) {
+            Ok(entries) => entries,
+            Err(error) => {
+                let folder = folder.display();
+                tracing::warn!("cannot look for older files in {folder}, so they stay: {error}");
+                return;
+            }
+        };
         let (stem, extension) = parts(&self.asked);
         let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
         let mut found: Vec<(usize, String, PathBuf)> = names

@@ -37,31 +37,29 @@ pub struct Args {
     sets: Vec<String>,
     /// Let each state of a track wait this long for the bearings after it that tell of it, seconds:
     /// the tracks that are written are smoothed, and their velocities about twice as good.
-    #[arg(long, value_name = "SECONDS", requires = "fuse", value_parser = numbers::lag,
-          allow_negative_numbers = true)]
+    #[arg(long, value_name = "SECONDS", requires = "fuse", value_parser = numbers::lag)]
     smooth: Option<f64>,
     /// The recording (MCAP) to write: all that was recorded, with the new tracks in place of the
     /// old.
     #[arg(short, long, value_name = "FILE", requires = "fuse")]
     output: Option<PathBuf>,
     /// Start this long after the first bearing, seconds of data time.
-    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::seconds,
-          allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::seconds)]
     from: f64,
     /// End this long after the first bearing, seconds of data time.
-    #[arg(
-        long,
-        value_name = "SECONDS",
-        value_parser = numbers::seconds,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::seconds)]
     to: Option<f64>,
     /// The network's file (TOML) to publish on; the replay stands in for the site's cameras.
     #[arg(long, value_name = "FILE", conflicts_with = "fuse", required_unless_present = "fuse")]
     network: Option<PathBuf>,
     /// How much faster than in life it is played onto the network; 0 is as fast as it goes.
-    #[arg(long, default_value_t = 1.0, value_name = "FACTOR", conflicts_with = "fuse",
-          value_parser = numbers::speed, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 1.0,
+        value_name = "FACTOR",
+        conflicts_with = "fuse",
+        value_parser = numbers::speed
+    )]
     speed: f64,
     /// Begin again at the end, until Ctrl-C; times go on.
     #[arg(long = "loop", conflicts_with = "fuse")]

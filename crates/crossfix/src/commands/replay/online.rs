@@ -103,14 +103,8 @@ fn ensure_heard(
     network: &NetworkConfig,
 ) -> anyhow::Result<()> {
     let &Contents { messages, newer, .. } = contents;
+    recorded::ensure_readable(recording, messages, newer)?;
     let recording = recording.display();
-    ensure!(
-        newer < messages,
-        "none of {messages} messages of {recording} can be read: they are of a newer version"
-    );
-    if newer > 0 {
-        tracing::warn!("{newer} of {messages} messages of {recording} are of a newer version");
-    }
     let is_known = |camera: &&CameraName| network.cameras.contains_key(*camera);
     let unknown: Vec<String> = contents
         .cameras

@@ -22,24 +22,49 @@ pub struct SiteArgs {
     #[arg(long, default_value_t = 4, value_name = "N", requires = "scenario")]
     cameras: usize,
     /// How long it lasts, seconds.
-    #[arg(long, default_value_t = 20.0, value_name = "S", requires = "scenario",
-          value_parser = numbers::seconds, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 20.0,
+        value_name = "S",
+        requires = "scenario",
+        value_parser = numbers::seconds
+    )]
     seconds: f64,
     /// Exposures a second of each camera.
-    #[arg(long, default_value_t = 10.0, value_name = "HZ", requires = "scenario",
-          value_parser = numbers::rate, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 10.0,
+        value_name = "HZ",
+        requires = "scenario",
+        value_parser = numbers::rate
+    )]
     rate_hz: f64,
     /// False bearings that an exposure brings in the mean.
-    #[arg(long, default_value_t = 1.0, value_name = "N", requires = "scenario",
-          value_parser = numbers::mean_count, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 1.0,
+        value_name = "N",
+        requires = "scenario",
+        value_parser = numbers::mean_count
+    )]
     clutter: f64,
     /// Probability that a camera reports a target in its image.
-    #[arg(long, default_value_t = 0.95, value_name = "P", requires = "scenario",
-          value_parser = numbers::probability, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 0.95,
+        value_name = "P",
+        requires = "scenario",
+        value_parser = numbers::probability
+    )]
     detection_probability: f64,
     /// Greatest rate of turn of the targets, radians a second; 0 is straight.
-    #[arg(long, default_value_t = 0.0, value_name = "RAD_PER_S", requires = "scenario",
-          value_parser = numbers::radians_per_second, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        default_value_t = 0.0,
+        value_name = "RAD_PER_S",
+        requires = "scenario",
+        value_parser = numbers::radians_per_second
+    )]
     turn: f64,
     /// Seed of everything random.
     #[arg(long, default_value_t = 1, value_name = "N", requires = "scenario")]

@@ -16,6 +16,7 @@ use crossfix_vision::{DetectorConfig, ImageTracker, PixelBox, TrackerConfig};
 use crate::commands::numbers;
 use crate::output::{self, Draft};
 use crate::repeats::Repeats;
+use crate::shutdown::Shutdown;
 use crate::{config, eye};
 use picture::Picture;
 use table::Table;
@@ -53,7 +54,8 @@ pub struct Args {
     /// certainties and innovations of every frame.
     #[arg(long, value_name = "FILE.rrd")]
     save: Option<PathBuf>,
-    /// Where the target truly is (CSV with the columns frame,x,y,w,h), for that picture.
+    /// Where the target truly is (CSV with the columns frame,x,y,w,h), for that picture; in a row
+    /// without a box there is no target.
     #[arg(long, value_name = "FILE", requires = "save")]
     labels: Option<PathBuf>,
     /// The tracker's configuration (TOML, the keys of a camera file's section `tracker`); its
@@ -157,7 +159,7 @@ impl Counted {
     }
 }
 
-/// Follows the targets through a video.
+/// Follows the targets through a video, to its end or until the program is asked to stop.
 fn follow(
     args: &Args,
     source: &mut dyn FrameSource,
@@ -167,7 +169,10 @@ fn follow(
 ) -> anyhow::Result<Counted> {
     let mut repeats = Repeats::default();
     let mut counted = Counted::default();
-    while let Some((index, read)) = next_frame(source, &mut repeats)? {
+    let shutdown = Shutdown::listen();
+    while !shutdown.requested()
+        && let Some((index, read)) = next_frame(source, &mut repeats)?
+    {
         counted.length = index + 1;
         if index < args.from {
             continue;
@@ -175,7 +180,9 @@ fn follow(
         let image = read.as_ref().and_then(eye::brightness);
         let (Some(frame), Some(image)) = (&read, &image) else {
             if read.is_some() {
-                tracing::warn!("frame {index} has no pixels; going on");
+                repeats.warn("no pixels", Instant::now(), || {
+                    format!("frame {index} has no pixels; going on")
+                });
             }
             counted.bad += 1;
             table.write(index, &[], 0.0)?;

@@ -13,6 +13,9 @@ use crate::commands::track::next_frame;
 use crate::eye;
 use crate::repeats::Repeats;
 
+/// How the names of video files end; beside one may lie its table and its picture.
+const VIDEOS: [&str; 3] = ["mp4", "avi", "y4m"];
+
 /// The tables of the drawn scenes and of the videos in a folder.
 pub(super) fn tables(
     options: ValidationOptions,
@@ -39,8 +42,9 @@ fn labelled_videos(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut videos = Vec::new();
     for entry in std::fs::read_dir(folder).with_context(context)? {
         let path = entry.with_context(context)?.path();
-        let is_table = path.extension().is_some_and(|extension| extension == "csv");
-        if !is_table && labels_of(&path).is_file() {
+        let extension = path.extension().and_then(|extension| extension.to_str());
+        let is_video = path.is_dir() || extension.is_some_and(|name| VIDEOS.contains(&name));
+        if is_video && labels_of(&path).is_file() {
             videos.push(path);
         }
     }

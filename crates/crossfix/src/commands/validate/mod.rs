@@ -82,10 +82,11 @@ struct Options {
     strict: bool,
 }
 
-/// Runs of an experiment, and scenes of each kind for an ablation, if nothing else is asked. With
-/// half of the runs the papers' figures have a standard error of up to five per cent; with half of
-/// the scenes a part that brings a per cent is seldom told from none.
+/// Runs of an experiment, if nothing else is asked. With half of them the papers' figures have a
+/// standard error of up to five per cent.
 const RUNS: u32 = 200;
+/// Scenes of each kind for an ablation, if nothing else is asked. With half of them a part that
+/// brings a per cent is seldom told from none.
 const SCENES: u32 = 10;
 
 pub fn run(what: &Args) -> anyhow::Result<()> {

@@ -61,8 +61,7 @@ impl Memory {
         self.pull = std::mem::take(&mut self.pull).remove_rows(first, ERRORS);
     }
 
-    /// The errors if no camera has been moved: their prior has unit
-    /// variance.
+    /// The errors if no camera has been moved: their prior has unit variance.
     pub(super) fn estimate(&self) -> Option<ErrorEstimate> {
         let size = self.pull.len();
         let factor = (&self.information + DMatrix::identity(size, size)).cholesky()?;

@@ -278,7 +278,6 @@ impl Handover {
     /// rivals, unless they give the same target.
     fn settle(&mut self, context: &ReadingContext<'_>) -> Vec<Start> {
         let ReadingContext { exposure, motion, .. } = *context;
-
         let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
         let all: Vec<&Reading> =
             self.seen.values().flatten().flat_map(|one| &one.readings).collect();
