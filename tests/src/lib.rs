@@ -108,8 +108,8 @@ pub fn real_data() -> Option<PathBuf> {
     data
 }
 
-/// Runs commands of a shell in a network of their own and returns what they print; `None` and a clear word
-/// where that is not to be had, or what they need: a command that succeeds where it is.
+/// Runs commands of a shell in a network of their own and returns what they print; `None` and a
+/// clear word where that is not to be had, or what they need: a command that succeeds where it is.
 pub fn alone(needed: &str, commands: &str) -> Option<String> {
     let shell =
         |commands: &str| Command::new("unshare").args(["-n", "sh", "-c", commands]).output();
@@ -183,7 +183,8 @@ impl Process {
         /// Of Linux, in what `/proc` counts.
         const TICKS_A_SECOND: f64 = 100.0;
         let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.0.id())).ok()?;
-        // The name, in brackets, may hold spaces; user and system time are the 12th and 13th after it.
+        // The name, in brackets, may hold spaces; user and system time are the 12th and 13th after
+        // it.
         let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
         let ticks = |index: usize| fields.get(index)?.parse::<f64>().ok();
         Some((ticks(11)? + ticks(12)?) / TICKS_A_SECOND)
@@ -231,7 +232,7 @@ pub struct Site {
 }
 
 impl Site {
-    /// The demo's scene for so many seconds.
+    /// The demo's scene for `duration_s` seconds.
     pub fn new(duration_s: f64) -> Self {
         let mut scene: Scene =
             toml::from_str(include_str!("../../configs/demo/scene.toml")).unwrap();
@@ -387,14 +388,16 @@ impl Site {
 
 /// Ports below those that the system gives to whoever asks for none.
 const PORTS: std::ops::Range<u32> = 10_240..32_000;
-/// Tests whose processes follow one another begin so many ports from each other.
-const PORTS_A_PROCESS: u32 = 131;
+/// Distance of the first ports of tests whose processes follow one another.
+const PORTS_PER_PROCESS: u32 = 131;
 
-/// So many endpoints on this machine that nobody uses now. They are listened at later, so those that the system
-/// gives would be given again meanwhile; here no test gives one twice, and another test hardly the same.
+/// `count` endpoints on this machine that nobody uses now. They are listened at later, so those
+/// that the system gives would be given again meanwhile; here no test gives one twice, and another
+/// test hardly the same.
 pub fn free_endpoints(count: usize) -> Vec<String> {
+    /// Number of ports that this process has given.
     static GIVEN: AtomicU32 = AtomicU32::new(0);
-    let begin = std::process::id().wrapping_mul(PORTS_A_PROCESS);
+    let begin = std::process::id().wrapping_mul(PORTS_PER_PROCESS);
     let ports = std::iter::repeat_with(|| {
         let place = begin.wrapping_add(GIVEN.fetch_add(1, Ordering::Relaxed));
         PORTS.start + place % PORTS.len() as u32

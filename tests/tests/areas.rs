@@ -16,13 +16,14 @@ use crossfix_simulation::Scene;
 use crossfix_tests::{Process, Site, messages, now_seconds, succeed};
 use nalgebra::Point3;
 
+/// How long the scene lasts, s: the target flies through both areas in this time.
 const DURATION_S: f64 = 28.0;
 /// The cameras of each area; the middle ones are in both.
 const AREAS: [(&str, &[&str]); 2] =
     [("west", &["w1", "w2", "m1", "m2"]), ("east", &["e1", "e2", "m1", "m2"])];
 
-/// Six cameras along a way, on both sides of it, and a target that flies down the way. Those in the west
-/// see it for the first half, those in the east for the second, those in the middle between.
+/// Six cameras along a way, on both sides of it, and a target that flies down the way. Those in the
+/// west see it for the first half, those in the east for the second, those in the middle between.
 fn scene() -> Scene {
     let cameras: String = [("w", -130.0_f64, 0.0), ("m", 0.0, 0.017), ("e", 130.0, 0.033)]
         .iter()
@@ -73,8 +74,8 @@ fn said(recording: &Path) -> Vec<Said> {
     all
 }
 
-/// Plays the site and returns what was said in its time; `meanwhile` is told when the scene begins by the
-/// wall's clock.
+/// Plays the site and returns what was said in its time; `meanwhile` is told when the scene begins
+/// by the wall's clock.
 fn play(site: &Site, meanwhile: impl FnOnce(f64)) -> Vec<Said> {
     let recorder = site.start_recorder("live.mcap");
     let begin = now_seconds() + 3.0;

@@ -16,7 +16,8 @@ use std::time::{Duration, Instant};
 
 use crossfix_tests::program;
 
-/// A page's commands take half a minute at most; three times that on a busy machine is not for ever.
+/// A page's commands take half a minute at most; three times that on a busy machine is not for
+/// ever.
 const PATIENCE: Duration = Duration::from_secs(150);
 /// Pages use the ports of `configs/site`: where they have no network of their own they take turns.
 static TURN: Mutex<()> = Mutex::new(());

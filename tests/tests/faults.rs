@@ -3,13 +3,15 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use crossfix_message::{
     BearingFrame, BearingTrack, Channel, Health, ImageTrackState, Key, Payload, Vector3, Version,
     decode,
 };
-use crossfix_tests::{PATIENCE, Site, crossfix, now_seconds};
+use crossfix_recording::{Entry, RecordingWriter};
+use crossfix_tests::{PATIENCE, Site, crossfix, messages, now_seconds, succeed};
 use crossfix_transport::{Link, Role};
 
 fn frame(camera: &str, sequence: u64, time_s: f64, bearing: Vector3) -> BearingFrame {
@@ -137,7 +139,7 @@ fn no_message_of_any_size_costs_much_memory() {
 
 #[test]
 fn a_full_disk_ends_the_recorder_with_a_clear_word() {
-    if !std::path::Path::new("/dev/full").exists() {
+    if !Path::new("/dev/full").exists() {
         eprintln!("SKIPPED: this system has no /dev/full");
         return;
     }
@@ -202,4 +204,38 @@ fn configurations_with_mistakes_are_explained_before_anything_starts() {
         &site.path(""),
         &["two cameras are called `north`", "zwilling.toml", "change the key `name`"],
     );
+}
+
+#[test]
+fn a_replay_counts_as_published_only_what_the_site_can_use() {
+    let site = Site::new(2.0);
+    let mut entries = messages(Path::new(&site.path("source.mcap")), |_| true);
+    let usable = entries.len();
+    let last = entries
+        .iter()
+        .rfind(|entry| matches!(entry.key.channel, Channel::Bearings(_)))
+        .unwrap()
+        .clone();
+    let foreign = Channel::Bearings("nobody".parse().unwrap());
+    let foreign_key = Key { channel: foreign, ..last.key.clone() };
+    let newer = BearingFrame {
+        version: Some(Version { major: 9, minor: 0 }),
+        ..decode(&last.data).unwrap()
+    };
+    entries.extend([
+        Entry { key: foreign_key.clone(), ..last.clone() },
+        Entry { key: foreign_key, ..last.clone() },
+        Entry { data: newer.encode_unstamped(), ..last },
+    ]);
+    let mut writer = RecordingWriter::create(Path::new(&site.path("mixed.mcap"))).unwrap();
+    entries.iter().for_each(|entry| writer.write(entry).unwrap());
+    writer.finish().unwrap();
+
+    let network = site.path("network.toml");
+    let replayed =
+        |file: &str| succeed(&["replay", &site.path(file), "--network", &network, "--speed", "0"]);
+    assert_eq!(replayed("source.mcap").trim(), format!("{usable} messages published"));
+    let said = replayed("mixed.mcap");
+    assert!(said.starts_with(&format!("{usable} messages published; left out: 2 of")), "{said}");
+    assert!(said.contains(", 1 that cannot be read"), "{said}");
 }

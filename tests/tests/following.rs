@@ -6,8 +6,11 @@ use std::path::Path;
 
 use crossfix_tests::{FollowedRow, crossfix, followed_rows, succeed};
 
+/// Width of the images, pixels.
 const WIDTH: usize = 320;
+/// Height of the images, pixels.
 const HEIGHT: usize = 240;
+/// Frame rate of the video.
 const RATE_HZ: f64 = 25.0;
 
 /// Where two spots are in a frame: the first from the beginning, the second from frame 30 on.

@@ -12,6 +12,7 @@ use crossfix_message::{BearingFrame, Channel, ClockSource, ImageTrackState, deco
 use crossfix_tests::{Site, alone, messages, program};
 use nalgebra::Vector2;
 
+/// The program that stands for the cameras.
 const CAMERAS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/peers/gige_cameras.py");
 /// A lens for the camera's image.
 const LENS: &str = "image_width: 512
@@ -52,7 +53,8 @@ kill $camera",
         entries.iter().map(|entry| decode(&entry.data).unwrap()).collect();
     assert!(frames.len() > 200, "{}", frames.len());
     assert!(frames.iter().all(|frame| frame.clock_source() == ClockSource::Host));
-    // The dot is drawn at whole pixels below its place, so it is half a pixel beside it in the mean.
+    // The dot is drawn at whole pixels below its place, so it is half a pixel beside it in the
+    // mean.
     let mut off = Vec::new();
     for frame in &frames {
         for track in frame.tracks.iter().filter(|t| t.state() == ImageTrackState::Tracking) {
@@ -80,8 +82,8 @@ kill $camera",
         off.sort_unstable_by(f64::total_cmp);
         let at = |share: f64| off[(share * (off.len() - 1) as f64) as usize];
         println!("{:.2} {:.2} {:.2} px", at(0.05), at(0.5), at(0.95));
-        // The template of an agent that leaves out frames holds the target a quarter of a pixel beside
-        // its middle: this test has the machine for itself (.config/nextest.toml).
+        // The template of an agent that leaves out frames holds the target a quarter of a pixel
+        // beside its middle: this test has the machine for itself (.config/nextest.toml).
         assert!(at(0.5).abs() < 0.2 && at(0.05) > -0.8 && at(0.95) < 0.8, "{off:?}");
     }
 }

@@ -5,8 +5,9 @@
 //! of the same bearings sees it here, and writes the file anew when that was meant:
 //! `CROSSFIX_GOLDEN=write cargo nextest run -p crossfix-tests --test golden`.
 //!
-//! With `CROSSFIX_GOLDEN=exact` (`.ci/run`) the bytes must be the same. Without it a machine whose system has
-//! other sines and cosines in the last bit passes with places that agree to a micrometre.
+//! With `CROSSFIX_GOLDEN=exact` (`.ci/run`) the bytes must be the same. Without it a machine whose
+//! system has other sines and cosines in the last bit passes with places that agree to a
+//! micrometre.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stderr,
@@ -21,7 +22,7 @@ use crossfix_message::{Channel, Timestamp, TrackFrame, TrackNumber, decode};
 use crossfix_tests::{messages, succeed};
 use sha2::{Digest, Sha256};
 
-/// Places may differ by so much where the bytes do, m.
+/// Places may differ by this much where the bytes do, m.
 const SAME_M: f64 = 1e-6;
 
 fn repository(path: &str) -> PathBuf {

@@ -1,5 +1,5 @@
-//! What whoever looks after a host meets: metrics, a file that is read again, an agent that dies, a clock
-//! that is set.
+//! What whoever looks after a host meets: metrics, a file that is read again, an agent that dies, a
+//! clock that is set.
 
 #![allow(
     clippy::unwrap_used,
@@ -249,8 +249,8 @@ rm -r "$dir""#,
     assert_eq!(lost[..], ["fail", "chrony runs, and has no time server"]);
 }
 
-/// A shared object that lets a test set the clock of one program; `None` and a clear word where it is
-/// not installed.
+/// A shared object that lets a test set the clock of one program; `None` and a clear word where it
+/// is not installed.
 fn clock_setter() -> Option<String> {
     let found = ["x86_64-linux-gnu", "aarch64-linux-gnu"]
         .map(|machine| format!("/usr/lib/{machine}/faketime/libfaketime.so.1"))

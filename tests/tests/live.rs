@@ -196,8 +196,8 @@ fn the_doctor_says_what_a_live_site_lacks() {
     assert!(fusion.stop() && playing.stop());
 }
 
-/// What `crossfix sources` finds of streams of cameras by GStreamer, in a network namespace of their
-/// own; `None` where there can be none, and a clear word.
+/// What `crossfix sources` finds of streams of cameras by GStreamer, in a network namespace of
+/// their own; `None` where there can be none, and a clear word.
 fn peers(login: &str, tried: &[&str]) -> Option<Vec<serde_json::Value>> {
     let python = "/usr/bin/python3";
     let imports = "import gi; gi.require_version('GstRtspServer', '1.0'); \

@@ -1,4 +1,5 @@
-//! What a site's network carries: agents with many tracks, through a router, to one who hears them all.
+//! What a site's network carries: agents with many tracks, through a router, to one who hears them
+//! all.
 //!
 //! `CROSSFIX_AGENTS=64 cargo nextest run --release -p crossfix-tests --test load --no-capture` is the whole
 //! load; the default is what a debug build on a busy machine carries.
@@ -19,8 +20,11 @@ use crossfix_message::{
 use crossfix_tests::{PATIENCE, Site, free_endpoints, free_network};
 use crossfix_transport::{Delivery, Link, Mode, NetworkConfig, Role};
 
+/// Frame rate of each agent.
 const RATE_HZ: u32 = 30;
+/// Tracks in each frame.
 const TRACKS: u64 = 20;
+/// How long it is measured, s.
 const SECONDS: u32 = 10;
 /// What 99 of 100 messages may take from agent to ear, ms.
 const MOST_MS: f64 = 5.0;
@@ -83,7 +87,7 @@ fn publish(network: &NetworkConfig, camera: &CameraName, begin: Instant) -> u64 
     frames.into()
 }
 
-/// A site of so many agents behind a router.
+/// A site of `agents` agents behind a router.
 fn site() -> (Site, NetworkConfig) {
     let cameras = (0..agents()).map(|k| format!("c{k}").parse().unwrap());
     let network =

@@ -27,26 +27,33 @@ use crossfix_transport::{Link, NetworkConfig, Role};
 
 /// Stands for a cable.
 const RELAY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/peers/relay.py");
-/// The cable's ends: where the site is, and where its camera `north` is.
+/// The cable's end where the site is.
 const NEAR: &str = "10.215.0.1";
+/// The cable's end where the site's camera `north` is.
 const FAR: &str = "10.215.0.2";
 
 /// A cable's delay and by how much that varies, s, and the share of packets that it loses.
 type Quality = [f64; 3];
+/// Nothing is wrong.
 const WHOLE: Quality = [0.0, 0.0, 0.0];
+/// Nothing passes.
 const CUT: Quality = [0.0, 0.0, 1.0];
+/// One packet in twenty is lost.
 const LOSING: Quality = [0.0, 0.0, 0.05];
+/// Every packet takes a fifth of a second.
 const SLOW: Quality = [0.2, 0.0, 0.0];
+/// Packets overtake each other.
 const OVERTAKING: Quality = [0.05, 0.05, 0.0];
 
 /// From the start of the agents until they play, s: all find each other meanwhile.
 const LEAD_S: f64 = 3.5;
-/// How long the site plays before something happens, s, and when its tracks are sure; how long it
-/// plays after it.
+/// How long the site plays before something happens, s.
 const BEFORE_S: f64 = 3.5;
+/// When its tracks are confirmed, s after it began to play.
 const SURE_S: f64 = 2.0;
+/// How long the site plays after something happened, s.
 const AFTER_S: f64 = 6.0;
-/// Whatever happened, nothing is left of it so long after its end, s.
+/// Whatever happened, nothing is left of it this long after its end, s.
 const RECOVERY_S: f64 = 5.0;
 /// A target is said at least each half second, and a camera waited for as long; and some noise, s.
 const SILENCE_S: f64 = 1.2;
@@ -69,6 +76,7 @@ struct Cable {
 impl Cable {
     /// `None`, and a clear word, where this may not be done.
     fn new() -> Option<Self> {
+        /// Number of cables so far: each needs its own name.
         static LAID: AtomicU32 = AtomicU32::new(0);
         let id = format!("cb{}n{}", std::process::id(), LAID.fetch_add(1, Ordering::Relaxed));
         let ends = ["a", "b"].map(|end| format!("{id}{end}"));
@@ -373,8 +381,8 @@ impl Heard {
         assert!(p99_s < LATENCY_S, "{p99_s} s");
     }
 
-    /// A log says of each key how much was lost, of a second gap at its end; together it is what was
-    /// counted, and of one kind it is what was not heard.
+    /// A log says of each key how much was lost, of a second gap at its end; together it is what
+    /// was counted, and of one kind it is what was not heard.
     fn assert_counted(&self, log: &str, counted: u64, kind: &str, unheard: u64) {
         let said = |line: &str| -> Option<(String, u64)> {
             let (before, after) = line.split_once(" messages on `")?;
@@ -516,8 +524,8 @@ fn flood(link: &Link, messages: u64) {
 
 #[test]
 fn a_flood_from_a_stranger_is_counted_to_the_message_and_disturbs_nobody() {
-    // As long as those who listen may take: with six tests beside it 14 s were measured, and after 8 the
-    // scene itself was over.
+    // As long as those who listen may take: with six tests beside it 14 s were measured, and after
+    // 8 the scene itself was over.
     let play = Play::new(60.0, None);
     let stranger: CameraName = "stranger".parse().unwrap();
     let link = Link::open(&play.network, &Role::Camera(stranger.clone())).unwrap();

@@ -1,5 +1,6 @@
-//! What others are told, read by their own programs (`tests/peers/outlets.py`): a recording's tracks in
-//! each format beside the table that `export` writes, and live ones over each kind of network.
+//! What others are told, read by their own programs (`tests/peers/outlets.py`): a recording's
+//! tracks in each format beside the table that `export` writes, and live ones over each kind of
+//! network.
 
 #![allow(
     clippy::unwrap_used,
@@ -136,7 +137,7 @@ struct Seen {
     place: Point3<f64>,
 }
 
-/// Holds what was read against the table: at least so many places, none off by more.
+/// Compares what was read with the table: at least a number of places, none off by more.
 fn assert_places(exported: &Exported, read: &[Seen], least: usize, off_m: f64) {
     let table = exported.table(read.iter().map(|read| read.time_s));
     let mut held = 0;
@@ -225,8 +226,8 @@ fn asterix_is_what_the_table_says() {
         ),
     };
     let places: Vec<Seen> = records.iter().map(place).collect();
-    // The time is told to 1/128 s, so the table is asked for what is nearest: a target of 20 m/s flies
-    // 8 cm meanwhile. The place is told to 0.6 m, the height to 1.9 m.
+    // The time is told to 1/128 s, so the table is asked for what is nearest: a target of 20 m/s
+    // flies 8 cm meanwhile. The place is told to 0.6 m, the height to 1.9 m.
     let tracks = exported.table((0..300).map(|tenth| 0.1 * f64::from(tenth)));
     assert!(records.len() > 80);
     for read in &places {
@@ -317,7 +318,7 @@ fn hear(stream: &mut impl Read, enough: impl Fn(&[u8]) -> bool) -> Vec<u8> {
     heard
 }
 
-/// So many events of Cursor on Target have come.
+/// Waits until a number of Cursor-on-Target events have come.
 fn events(heard: &[u8]) -> usize {
     String::from_utf8_lossy(heard).matches("</event>").count()
 }

@@ -49,8 +49,8 @@ fn told(address: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     panic!("never as it is wanted: {text}");
 }
 
-/// What a browser shows once the page says something (`tests/peers/page.mjs`); `None` and a clear word
-/// where there is none.
+/// What a browser shows once the page says something (`tests/peers/page.mjs`); `None` and a clear
+/// word where there is none.
 fn browsed(address: &str, says: &str, picture: &str) -> Option<Value> {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/peers/page.mjs");
     let url = format!("http://{address}/");

@@ -16,10 +16,12 @@ use crossfix_tests::{crossfix, succeed};
 use nalgebra::{Point3, Vector3};
 use serde::Deserialize;
 
+/// The program that reads the picture.
 const READER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/peers/picture.py");
+/// How long the scene lasts, s.
 const DURATION_S: f64 = 10.0;
-/// No line, point or box is drawn anew more often than this, 1/s: what is fewer moves in jerks, and what
-/// is more fills the viewer's memory.
+/// No line, point or box is drawn again more often than this, 1/s: what is fewer moves in jerks, and
+/// what is more fills the viewer's memory.
 const DRAWN_HZ: std::ops::Range<f64> = 5.0..12.0;
 
 #[derive(Debug, Deserialize)]
@@ -41,7 +43,7 @@ impl Entity {
         self.components.iter().any(|one| one == component)
     }
 
-    /// Whether it reaches from one corner to another, within so many metres.
+    /// Whether it reaches from one corner to another, within some metres.
     fn reaches(&self, low: Point3<f64>, high: Point3<f64>, within_m: f64) -> bool {
         let [from, to] = self.corners();
         (from - low).amax() < within_m && (to - high).amax() < within_m
@@ -69,9 +71,9 @@ fn shown(picture: &Path, png: &str) -> Option<Shown> {
     Some(serde_json::from_slice(&output.stdout).unwrap())
 }
 
-/// They appear after a second, and are found within the half second after; that is how far they fly
-/// in a quarter of one, m.
+/// When the targets are found, s: they appear after a second, and half a second is enough.
 const FOUND_AFTER_S: f64 = 1.5;
+/// How far a target flies in a quarter of a second, m.
 const NEAR_M: f64 = 2.5;
 
 /// The corners of where a target of the scene flies once it has been found.
@@ -169,8 +171,8 @@ fn the_demos_picture_shows_the_site_its_cameras_and_each_target_where_it_was() {
     }
 }
 
-/// Degrees of latitude and of longitude that a metre to the north and to the east is, at sea level: by the radii
-/// of curvature of the ellipsoid (WGS84) along the meridian and across.
+/// Degrees of latitude and of longitude that a metre to the north and to the east is, at sea level:
+/// by the radii of curvature of the ellipsoid (WGS84) along the meridian and across.
 fn degrees_a_metre(latitude_deg: f64) -> [f64; 2] {
     let (sin, cos) = latitude_deg.to_radians().sin_cos();
     let (equator, squared) = (6_378_137.0, 6.694_379_990_14e-3);

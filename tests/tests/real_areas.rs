@@ -1,5 +1,5 @@
-//! Two areas on real data: the drone of the drone-tracking-datasets, its six cameras divided between two
-//! fusion centres in every way in which two of them are shared.
+//! Two areas on real data: the drone of the drone-tracking-datasets, its six cameras divided
+//! between two fusion centres in every way in which two of them are shared.
 
 #![allow(
     clippy::unwrap_used,
@@ -17,6 +17,7 @@ use crossfix_message::{
 use crossfix_tests::{messages, real_data, succeed};
 use nalgebra::Point3;
 
+/// The data set's cameras.
 const CAMERAS: [&str; 6] = ["gopro3", "mate10", "mate7", "sony5100", "sony5n_1440x1080", "sonyG"];
 /// A state that was said longer ago than this says nothing of now, s.
 const FRESH_S: f64 = 0.6;
@@ -45,10 +46,11 @@ impl Centre {
             return Vec::new();
         }
         let outputs = self.fusion.ingest(frame);
-        let tracks = self.neighbours.pass(outputs).into_iter().filter_map(|output| match output {
-            Output::Tracks(frame) => Some(frame),
-            _ => None,
-        });
+        let tracks =
+            self.neighbours.forward(outputs).into_iter().filter_map(|output| match output {
+                Output::Tracks(frame) => Some(frame),
+                _ => None,
+            });
         tracks.collect()
     }
 }
@@ -58,7 +60,7 @@ impl Centre {
 struct Known(BTreeMap<u64, (f64, usize, Track)>);
 
 impl Known {
-    fn hear(&mut self, who: usize, frame: &TrackFrame) {
+    fn receive(&mut self, who: usize, frame: &TrackFrame) {
         let seconds = Timestamp::from_nanos(frame.time_ns).seconds();
         for track in &frame.tracks {
             if track.state() == TrackState::Confirmed {
@@ -79,8 +81,8 @@ impl Known {
     }
 }
 
-/// What came of one way of dividing the cameras: of the instants of the truth at which a sure track was
-/// said.
+/// What came of one way of dividing the cameras: of the instants of the truth at which a sure track
+/// was said.
 #[derive(Debug, Default)]
 struct Outcome {
     said: usize,
@@ -121,8 +123,8 @@ fn divided(
         let seconds = Timestamp::from_nanos(frame.capture_time_ns).seconds();
         for who in [0, 1] {
             for said in centres[who].take(frame) {
-                known.hear(who, &said);
-                centres[1 - who].neighbours.hear(who, &said);
+                known.receive(who, &said);
+                centres[1 - who].neighbours.receive(who, &said);
             }
         }
         // What was said a tenth of a second ago has been handled by both.

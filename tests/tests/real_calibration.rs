@@ -84,8 +84,8 @@ fn phones_whose_clocks_wander_are_calibrated_too() {
     check(&Flight::new(&data, "1", cameras).figures("3"), 0.090, 0.29);
 }
 
-/// The other half of the flight, of which no log is read, by what the first half knew; also of a recording
-/// that was made with a calibration, which another file than that is not taken for.
+/// The other half of the flight, of which no log is read, by what the first half knew; also of a
+/// recording that was made with a calibration, which another file than that is not taken for.
 #[test]
 fn a_night_later_the_site_is_at_least_as_good_without_a_log() {
     let Some(data) = real_data() else { return };
@@ -112,8 +112,8 @@ fn a_night_later_the_site_is_at_least_as_good_without_a_log() {
     assert!((rmse(&again) - rmse(&after)).abs() < 0.01, "{} and {}", rmse(&again), rmse(&after));
 }
 
-/// Half of what was flown is held out, and what it is worth is said; a sheet of plots of each camera and a
-/// picture for Rerun are written, and fit the figures.
+/// Half of what was flown is held out, and what it is worth is said; a sheet of plots of each
+/// camera and a picture for Rerun are written, and fit the figures.
 #[test]
 fn a_flight_is_shown_and_half_of_it_held_out() {
     let Some(data) = real_data() else { return };
@@ -125,7 +125,8 @@ fn a_flight_is_shown_and_half_of_it_held_out() {
     let shown = ["--hold-out", "half", "--plots", &plots, "--save", &picture];
     let said = succeed(&[&calibrate[..], &shown, &["-o", &file, "--json"]].concat());
     let figures: Value = serde_json::from_str(&said).unwrap();
-    // Two and a half minutes teach less than five: the whole part's bound is 0.055 m root mean square.
+    // Two and a half minutes teach less than five: the whole part's bound is 0.055 m root mean
+    // square.
     let held_out = &figures["held_out"]["against_log"];
     let number = |name: &str| held_out[name].as_f64().unwrap();
     assert!(number("found") > 0.99 && number("median_m") < 0.06, "{held_out:#}");
@@ -143,8 +144,9 @@ fn a_flight_is_shown_and_half_of_it_held_out() {
     assert!(std::fs::read(flight.path("flight.rrd")).unwrap().starts_with(b"RRF2"));
 }
 
-/// One half of the flight with its log says where the cameras stand; the other half, of which nothing
-/// is known, must find them there by three places alone, with clocks that agree among themselves.
+/// One half of the flight with its log says where the cameras stand; the other half, of which
+/// nothing is known, must find them there by three places alone, with clocks that agree among
+/// themselves.
 #[test]
 fn an_unknown_flight_finds_cameras_where_a_known_one_did() {
     let Some(data) = real_data() else { return };
@@ -184,7 +186,7 @@ fn an_unknown_flight_finds_cameras_where_a_known_one_did() {
         // 5 cm of three places, seen from as far.
         assert!(aside * arm.norm() < 0.25, "{}: {aside} rad", known.name);
         let middle_s = found.clock.knots_s[found.clock.knots_s.len() / 2][0];
-        ahead.push(known.clock.at(middle_s).0 - found.clock.at(middle_s).0);
+        ahead.push(known.clock.at(middle_s).ahead_s - found.clock.at(middle_s).ahead_s);
     }
     assert_eq!(ahead.len(), 3, "the drone was in the middle of all three");
     let (least, most) =
@@ -192,8 +194,8 @@ fn an_unknown_flight_finds_cameras_where_a_known_one_did() {
     assert!(most - least < 0.02, "{ahead:?}");
 }
 
-/// What `calibrate check` says of a recording by a calibration: its exit code, and the verdict on each
-/// camera.
+/// What `calibrate check` says of a recording by a calibration: its exit code, and the verdict on
+/// each camera.
 fn checked(recording: &str, calibration: &str) -> (Option<i32>, Vec<(String, String)>) {
     let output = crossfix(&["calibrate", "check", recording, "-c", calibration, "--json"]);
     let cameras: Vec<Value> = serde_json::from_slice(&output.stdout).unwrap();

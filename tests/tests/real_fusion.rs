@@ -1,4 +1,4 @@
-//! The fusion on real data: the drone of the drone-tracking-datasets held against its RTK, and two
+//! The fusion on real data: the drone of the drone-tracking-datasets compared with its RTK, and two
 //! real targets, the drone and itself half a minute later, in the same cameras.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
@@ -14,7 +14,7 @@ use crossfix_message::{
 use crossfix_tests::{messages, real_data, succeed};
 use nalgebra::{Point3, Vector3};
 
-/// The second target is where the first will be so much later.
+/// The second target is where the first will be this much later.
 const SHIFT_S: f64 = 30.0;
 /// A track within this of a target is its own, m.
 const NEAR_M: f64 = 2.0;
@@ -140,8 +140,8 @@ struct Asked {
 }
 
 /// Poses and clocks come from the flight's first half. The fit's residual is declared as the poses'
-/// deviation, and as that of the clocks the time in which the drone moves by as much. The limits are
-/// what is reached now and a little more: they guard it, and do not say that it is good.
+/// deviation, and as that of the clocks the time in which the drone moves by as much. The limits
+/// are what is reached now and a little more: they guard it, and do not say that it is good.
 const ASKED: [Asked; 4] = [
     Asked {
         dataset: "3",
@@ -161,7 +161,8 @@ const ASKED: [Asked; 4] = [
         instants: 240,
         most: [0.105, 0.24, 5.0],
     },
-    // A lens that is 11 mrad wrong in a corner, and one camera that sees the drone alone for seconds.
+    // A lens that is 11 mrad wrong in a corner, and one camera that sees the drone alone for
+    // seconds.
     Asked {
         dataset: "3",
         cameras: "gopro3,mate7,sony5n_1440x1080",

@@ -8,7 +8,7 @@ use crossfix_message::{Channel, TrackFrame, TrackState, decode};
 use crossfix_recording::Entry;
 use crossfix_tests::{Process, Site, messages, now_seconds};
 
-/// What is asked of every fault: all is as before so long after its cause has ended, s.
+/// What is asked of every fault: all is as before this long after its cause has ended, s.
 const RECOVERED_S: f64 = 5.0;
 
 fn router(site: &Site) -> Process {

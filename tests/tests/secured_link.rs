@@ -9,7 +9,7 @@ use crossfix_message::{CameraName, Channel};
 use crossfix_tests::{PATIENCE, Site};
 use crossfix_transport::{Delivery, Link, LinkPublisher, Role, Subscription};
 
-/// Publishes so many numbered messages, one each millisecond.
+/// Publishes a number of numbered messages, one per millisecond.
 fn count_aloud(publisher: &LinkPublisher, messages: u32) {
     for number in 0..messages {
         publisher.put(number.to_le_bytes().to_vec()).unwrap();
@@ -31,6 +31,7 @@ fn missing(heard: &Subscription, messages: u32) -> BTreeSet<u32> {
 
 #[test]
 fn a_secured_link_is_not_broken_by_what_goes_both_ways() {
+    /// Messages in each direction.
     const MESSAGES: u32 = 5000;
     let mut site = Site::new(1.0);
     site.route();

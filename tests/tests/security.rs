@@ -17,7 +17,7 @@ use zenoh::{Config, Session, Wait};
 
 /// How long what was put is on its way at most, health's own second included.
 const ARRIVED: Duration = Duration::from_millis(1500);
-/// So many messages an intruder sends.
+/// Number of messages that an intruder sends.
 const SENT: u64 = 20;
 
 /// The files by which somebody shows who he is.

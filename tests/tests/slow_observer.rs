@@ -20,10 +20,11 @@ use crossfix_tests::{Site, messages, program, succeed};
 /// longer than a peer may be silent, and are made again within three to twenty, behind what was on
 /// the way. After that it can count.
 const PLAYED_S: f64 = 60.0;
-/// How long it is played where a cable is pulled, and when that is. A receiver is given up 3 s later.
+/// How long the site is played where a cable is pulled, s.
 const PLAYED_TO_PULL_S: f64 = 15.0;
+/// When the cable is pulled. A receiver is given up 3 s later.
 const PULLED_AFTER: Duration = Duration::from_secs(5);
-/// More receivers than Zenoh has threads to receive on unless it is told to have more.
+/// More receivers than Zenoh has threads to receive on by default.
 const PULLED_RECORDERS: usize = 3;
 /// Where the site is.
 const ADDRESS: &str = "10.213.0.1";
@@ -148,7 +149,7 @@ fn p99_ms(names: &Namespaces, site: &Site, far: &Far) -> f64 {
     evaluation["latency"]["p99_ms"].as_f64().unwrap()
 }
 
-/// A site of so many seconds whose addresses are in the namespaces; `None`, and a clear word, where
+/// A site of some seconds whose addresses are in the namespaces; `None`, and a clear word, where
 /// there can be none.
 fn site(played_s: f64) -> Option<(Namespaces, Site)> {
     let Some(names) = Namespaces::new() else {

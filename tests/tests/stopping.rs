@@ -27,7 +27,7 @@ struct Traffic {
 }
 
 impl Traffic {
-    /// Frames of every camera of a network, each so many a second.
+    /// Frames of every camera of a network, at one rate each.
     fn new(network: &NetworkConfig, site: &Site, rate_hz: f64) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let link = Arc::new(Link::open(network, &Role::Cameras { and_fusion: false }).unwrap());
@@ -84,7 +84,7 @@ fn wait_until_recorded(path: &str, bytes: u64) {
     }
 }
 
-/// Stops the recorder and the fusion centre in the middle of so many cameras' traffic.
+/// Stops the recorder and the fusion centre in the middle of the traffic of several cameras.
 fn stop_under_traffic(cameras: usize, rate_hz: f64) {
     let site = Site::new(2.0);
     let names = (0..cameras).map(|number| format!("camera-{number}").parse().unwrap());

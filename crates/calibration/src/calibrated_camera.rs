@@ -2,12 +2,12 @@
 
 use crossfix_geometry::{Bearing, Camera, GeometryError, ImageSize, Pixel, PixelCovariance};
 use crossfix_message::{CameraCalibration, CameraName, LastingNoise, Timestamp};
-use nalgebra::{Matrix2, Matrix6};
+use nalgebra::{Matrix2, Matrix6, Unit, Vector3};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::label_noise::LabelNoise;
-use crate::lens::{self, LensUncertainty};
+use crate::lens::{self, LensUncertainty, SeenTarget};
 
 /// A pixel has no bearing where the lens may be off by more than this many deviations of the
 /// labels: in the corners of a wide lens that no flight has crossed it is off by 50 pixels. At
@@ -22,8 +22,8 @@ pub enum BearingError {
     Lens(#[from] GeometryError),
     /// The calibration saw nothing in that part of the image.
     #[error(
-        "the lens is known to {sd_px:.0} pixels there: calibrate with a flight or landmarks in that part \
-         of the image"
+        "the lens is known to {sd_px:.0} pixels there: calibrate with a flight or landmarks in \
+         that part of the image"
     )]
     Uncovered {
         /// Standard deviation of the lens there, pixels.
@@ -102,6 +102,15 @@ pub(crate) fn grid(size: ImageSize) -> impl Iterator<Item = Pixel> {
     })
 }
 
+/// How far the common time is ahead of a camera's own clock.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ClockOffset {
+    /// The common time less the camera's own, s.
+    pub ahead_s: f64,
+    /// Its standard deviation, s.
+    pub sd_s: f64,
+}
+
 impl CalibratedCamera {
     /// Its message for the cameras' channel, without the site's datum.
     pub(crate) fn message(&self, valid_from: Timestamp) -> CameraCalibration {
@@ -123,9 +132,8 @@ impl CalibratedCamera {
     /// [`BearingError`] where the lens has no direction, or the lens is not known well enough.
     pub fn bearing(&self, pixel: Pixel) -> Result<Bearing, BearingError> {
         let model = self.camera.model();
-        let place = (self.range_m, self.camera.pose().rotation());
-        let direction = model.direction(pixel)?;
-        let lens = self.lens.covariance_px2(model.intrinsics(), &direction, place);
+        let target = self.seen_target(model.direction(pixel)?, self.range_m);
+        let lens = self.lens.covariance_px2(model.intrinsics(), &target);
         // sqrt(tr C / 2): root mean variance over both axes.
         let lens_px = lens.map_or(f64::INFINITY, |lens| (lens.trace() / 2.0).sqrt());
         if lens_px > MOST_LENS_SHARE * self.noise.sd_px() {
@@ -141,14 +149,18 @@ impl CalibratedCamera {
     pub fn pointing_sd_rad(&self, pixel: Pixel, range_m: f64) -> Option<f64> {
         let model = self.camera.model();
         let intrinsics = model.intrinsics();
-        let direction = model.direction(pixel).ok()?.into_inner();
-        let place = (range_m, self.camera.pose().rotation());
-        let pose = lens::pose_covariance_px2(intrinsics, &direction, place, &self.pose_covariance)?;
-        let lens = self.lens.covariance_px2(intrinsics, &direction, place)?;
+        let target = self.seen_target(model.direction(pixel).ok()?, range_m);
+        let pose = lens::pose_covariance_px2(intrinsics, &target, &self.pose_covariance)?;
+        let lens = self.lens.covariance_px2(intrinsics, &target)?;
         // A bearing's covariance must not be zero.
         let least = Matrix2::identity() * LEAST_POINTING_PX.powi(2);
         let bearing = model.bearing(pixel, PixelCovariance(pose + lens + least)).ok()?;
         Some((bearing.covariance().trace() / 2.0).sqrt())
+    }
+
+    fn seen_target(&self, direction: Unit<Vector3<f64>>, range_m: f64) -> SeenTarget<'_> {
+        let world_from_camera = self.camera.pose().rotation();
+        SeenTarget { direction: direction.into_inner(), range_m, world_from_camera }
     }
 
     /// Standard deviation of a bearing due to the lens alone, at the calibration's range: root mean
@@ -172,7 +184,7 @@ impl CalibratedCamera {
     /// its standard deviation, s.
     pub fn common_time(&self, own: Timestamp, row: f64) -> (Timestamp, f64) {
         let height = f64::from(self.camera.model().intrinsics().size.height);
-        let (ahead_s, sd_s) = self.clock.at(own.seconds());
+        let ClockOffset { ahead_s, sd_s } = self.clock.at(own.seconds());
         // The frame's time is that of the middle row.
         let row_s = self.clock.readout_s * (row / height - 0.5);
         (own.plus_seconds(ahead_s + row_s), sd_s)
@@ -185,29 +197,29 @@ impl ClockCorrection {
         Self { knots_s: Vec::new(), rate: 0.0, rate_sd: 0.0, wander_s: 0.0, readout_s: 0.0 }
     }
 
-    /// The correction at one of its times, and the standard deviation, s.
-    pub fn at(&self, own_s: f64) -> (f64, f64) {
+    /// The correction at one of its times.
+    pub fn at(&self, own_s: f64) -> ClockOffset {
         let after = self.knots_s.partition_point(|knot| knot[0] <= own_s);
         match (after.checked_sub(1).and_then(|k| self.knots_s.get(k)), self.knots_s.get(after)) {
             (Some(before), Some(next)) => {
                 let share = (own_s - before[0]) / (next[0] - before[0]);
                 let between = |k: usize| before[k] + (next[k] - before[k]) * share;
-                (between(1), between(2))
+                ClockOffset { ahead_s: between(1), sd_s: between(2) }
             }
             (Some(last), None) => self.extrapolated(last, own_s),
             (None, Some(first)) => self.extrapolated(first, own_s),
-            (None, None) => (0.0, 0.0),
+            (None, None) => ClockOffset { ahead_s: 0.0, sd_s: 0.0 },
         }
     }
 
     /// The correction before the first knot or after the last.
-    fn extrapolated(&self, knot: &[f64; 3], own_s: f64) -> (f64, f64) {
+    fn extrapolated(&self, knot: &[f64; 3], own_s: f64) -> ClockOffset {
         let away = own_s - knot[0];
         // Beyond the knots: the end's variance, the rate's times away^2, and the random walk's
         // times |away|.
         let variance =
             knot[2].powi(2) + (self.rate_sd * away).powi(2) + self.wander_s.powi(2) * away.abs();
-        (knot[1] + self.rate * away, variance.sqrt())
+        ClockOffset { ahead_s: knot[1] + self.rate * away, sd_s: variance.sqrt() }
     }
 
     pub(crate) fn is_possible(&self) -> bool {

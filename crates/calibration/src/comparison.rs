@@ -122,9 +122,17 @@ pub struct CameraComparison {
     /// How much more the second's clock is corrected than the first's, beside what all clocks have
     /// in common, s; `None` where one was not calibrated.
     pub later_s: Option<f64>,
-    /// Pixels over the image, and where the second shows, after the move, what the first shows
-    /// there.
-    pub pixels: Vec<(Pixel, Pixel)>,
+    /// Pixels over the image.
+    pub pixels: Vec<ShownPixel>,
+}
+
+/// Where a target is shown at the first calibration's range.
+#[derive(Clone, Copy, Debug)]
+pub struct ShownPixel {
+    /// By the first calibration.
+    pub first: Pixel,
+    /// By the second, after the move of the site.
+    pub second: Pixel,
 }
 
 /// A pixel of a camera in both calibrations, as a sight line.
@@ -238,10 +246,16 @@ fn site_move(mut moved: SiteMove, cameras: &[Vec<ComparedPixel>]) -> Option<Site
     Some(moved)
 }
 
+/// Root of the mean of some squares.
+fn root_mean(squares: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let count = squares.len() as f64;
+    (squares.sum::<f64>() / count).sqrt()
+}
+
 fn later_s(one: &CalibratedCamera, other: &CalibratedCamera) -> Option<f64> {
     let middle = one.clock.knots_s.get(one.clock.knots_s.len() / 2)?[0];
     other.clock.knots_s.first()?;
-    Some(other.clock.at(middle).0 - one.clock.at(middle).0)
+    Some(other.clock.at(middle).ahead_s - one.clock.at(middle).ahead_s)
 }
 
 fn camera(
@@ -251,10 +265,8 @@ fn camera(
     moved: &SiteMove,
     later_s: Option<f64>,
 ) -> CameraComparison {
-    // Root mean square; an angle's square is that of two axes, hence the halves below.
-    let mean = |value: &dyn Fn(&ComparedPixel) -> f64| {
-        (sights.iter().map(value).sum::<f64>() / sights.len() as f64).sqrt()
-    };
+    // An angle's square is that of two axes, hence the halves below.
+    let mean = |square: &dyn Fn(&ComparedPixel) -> f64| root_mean(sights.iter().map(square));
     let focal = |camera: &CalibratedCamera| camera.camera.model().intrinsics().fx;
     let centre = moved.applied(one.camera.pose().position());
     CameraComparison {
@@ -269,7 +281,8 @@ fn camera(
         pixels: sights
             .iter()
             .filter_map(|sight| {
-                Some((sight.pixel, other.camera.project(moved.applied(sight.target))?))
+                let second = other.camera.project(moved.applied(sight.target))?;
+                Some(ShownPixel { first: sight.pixel, second })
             })
             .collect(),
     }

@@ -27,7 +27,10 @@ pub enum IntrinsicsError {
     #[error("the lens model `{0}` is not known: plumb_bob, radtan, equidistant or fisheye")]
     Model(String),
     /// A file of several cameras, none of which was asked for.
-    #[error("the file is of several cameras ({0}): say which, as in `camchain.yaml#{first}`", first = .0.split(", ").next().unwrap_or("cam0"))]
+    #[error(
+        "the file is of several cameras ({0}): say which, as in `camchain.yaml#{first}`",
+        first = .0.split(", ").next().unwrap_or("cam0")
+    )]
     Several(String),
     /// A camera that the file has not.
     #[error("the file has no camera `{wanted}`: it has {known}")]

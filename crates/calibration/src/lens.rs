@@ -23,7 +23,7 @@ const CENTRE_SD: f64 = 3.0 / 1920.0;
 const DISTORTION_SD: f64 = 1.0 / 3.0;
 /// Standard deviation that keeps a number fixed, as where a coefficient is zero. With half of it
 /// the same.
-const HELD_SD: f64 = 1e-9;
+const FIXED_SD: f64 = 1e-9;
 
 /// A place in the image with its derivatives.
 #[derive(Clone, Copy, Debug)]
@@ -74,10 +74,12 @@ pub enum LensFreedom {
 /// hundredth of their width off the axis. With half of them a data sheet that is 10 % off is four
 /// deviations off.
 const GUESSED: [f64; 3] = [0.05, 0.003, 20.0 / 1920.0];
-/// The same for Brown and Conrady's coefficients (k1, k2, p1, p2, k3) and for a fisheye's: beyond
-/// these a lens for surveillance would show straight walls as barrels. With half of them such
-/// lenses are held to the guess, and their corners stay bent.
+/// The same for Brown and Conrady's coefficients (k1, k2, p1, p2, k3): beyond these a lens for
+/// surveillance would show straight walls as barrels. With half of them such lenses are kept near
+/// the guess, and their corners stay bent.
 const GUESSED_BROWN_CONRADY: [f64; 5] = [0.2, 0.2, 0.003, 0.003, 0.1];
+/// The same for a fisheye's coefficients (k1 to k4). With half of them the corners of such a lens
+/// stay bent as well.
 const GUESSED_FISHEYE: [f64; 4] = [0.05; 4];
 
 impl LensFreedom {
@@ -86,7 +88,7 @@ impl LensFreedom {
         let centre = CENTRE_SD * f64::from(intrinsics.size.width);
         let mut deviations = vec![LOG_FOCAL_SD, LOG_ASPECT_SD, centre, centre];
         let distortion = coefficients(&intrinsics.distortion);
-        deviations.extend(distortion.iter().map(|k| (k.abs() * DISTORTION_SD).max(HELD_SD)));
+        deviations.extend(distortion.iter().map(|k| (k.abs() * DISTORTION_SD).max(FIXED_SD)));
         if self == Self::Guess {
             let [focal, aspect, centre] = GUESSED;
             let centre = centre * f64::from(intrinsics.size.width);
@@ -103,7 +105,7 @@ impl LensFreedom {
             Self::All | Self::Guess => deviations.len(),
         };
         // The logarithm of the focal length is the first parameter: `Focal` frees it alone.
-        deviations[free..].fill(HELD_SD);
+        deviations[free..].fill(FIXED_SD);
         deviations
     }
 }
@@ -170,21 +172,36 @@ pub struct LensUncertainty {
     pub pose_by_lens: DMatrix<f64>,
 }
 
+/// A target as a camera sees it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SeenTarget<'a> {
+    /// In the camera's frame.
+    pub(crate) direction: Vector3<f64>,
+    pub(crate) range_m: f64,
+    /// The camera's rotation.
+    pub(crate) world_from_camera: &'a nalgebra::Rotation3<f64>,
+}
+
+impl SeenTarget<'_> {
+    /// Its place in the camera's frame, m.
+    fn point(&self) -> Vector3<f64> {
+        self.direction * self.range_m
+    }
+}
+
 impl LensUncertainty {
-    /// Covariance of a pixel due to the lens, with the pose following it, where targets at a range
-    /// (m) are seen in the camera's frame along `direction`, pixels^2: large where the image was
-    /// not covered.
+    /// Covariance of a target's pixel due to the lens, with the pose following it, pixels^2: large
+    /// where the image was not covered.
     pub(crate) fn covariance_px2(
         &self,
         intrinsics: &Intrinsics,
-        direction: &Vector3<f64>,
-        place: (f64, &nalgebra::Rotation3<f64>),
+        target: &SeenTarget<'_>,
     ) -> Option<Matrix2<f64>> {
-        let seen = project(intrinsics, &(direction * place.0))?;
+        let seen = project(intrinsics, &target.point())?;
         let count = self.covariance.nrows();
         let by_lens = DMatrix::from_fn(2, count, |axis, number| seen.by_lens[number][axis]);
         // d(pixel) / d(lens) = direct part + d(pixel) / d(pose) x d(pose) / d(lens)
-        let by = by_lens + by_pose(&seen, direction, place) * &self.pose_by_lens;
+        let by = by_lens + by_pose(&seen, target) * &self.pose_by_lens;
         let covariance = &by * &self.covariance * by.transpose();
         Some(covariance.fixed_view::<2, 2>(0, 0).into_owned())
     }
@@ -193,25 +210,20 @@ impl LensUncertainty {
 /// Covariance of a pixel due to a pose's covariance, for the same target.
 pub(crate) fn pose_covariance_px2(
     intrinsics: &Intrinsics,
-    direction: &Vector3<f64>,
-    place: (f64, &nalgebra::Rotation3<f64>),
+    target: &SeenTarget<'_>,
     covariance: &nalgebra::Matrix6<f64>,
 ) -> Option<Matrix2<f64>> {
-    let by = by_pose(&project(intrinsics, &(direction * place.0))?, direction, place);
+    let by = by_pose(&project(intrinsics, &target.point())?, target);
     Some(by * covariance * by.transpose())
 }
 
 /// Derivative of a pixel by the camera's rotation about its own axes and by its centre.
-fn by_pose(
-    seen: &Projection,
-    direction: &Vector3<f64>,
-    (range_m, world_from_camera): (f64, &nalgebra::Rotation3<f64>),
-) -> nalgebra::Matrix2x6<f64> {
+fn by_pose(seen: &Projection, target: &SeenTarget<'_>) -> nalgebra::Matrix2x6<f64> {
     let mut by_pose = nalgebra::Matrix2x6::zeros();
     // R <- R exp(d) turns the point by point x d, and a centre moved by c moves it by -R' c.
-    let turn = seen.by_point * (direction * range_m).cross_matrix();
+    let turn = seen.by_point * target.point().cross_matrix();
     by_pose.fixed_columns_mut::<3>(0).copy_from(&turn);
-    let by_centre = -seen.by_point * world_from_camera.matrix().transpose();
+    let by_centre = -seen.by_point * target.world_from_camera.matrix().transpose();
     by_pose.fixed_columns_mut::<3>(3).copy_from(&by_centre);
     by_pose
 }

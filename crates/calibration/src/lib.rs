@@ -56,8 +56,10 @@ mod lens;
 mod site_file;
 mod survey;
 
-pub use calibrated_camera::{BearingError, CalibratedCamera, ClockCorrection, OverImage};
-pub use comparison::{CameraComparison, SiteComparison, SiteMove, compare_sites};
+pub use calibrated_camera::{
+    BearingError, CalibratedCamera, ClockCorrection, ClockOffset, OverImage,
+};
+pub use comparison::{CameraComparison, ShownPixel, SiteComparison, SiteMove, compare_sites};
 pub use flight::{
     Axis, CameraLabels, CameraResult, ClockKnot, ClockResult, FittedLabel, FittedSample,
     FlightError, FlightLog, FlightResult, Label, LandmarkMisfit, LogErrors, LogFit, LogSample,

@@ -310,8 +310,8 @@ fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
 /// Whether a matrix may be a covariance. Its numbers have different units, so it is judged as a
 /// correlation matrix.
 fn is_covariance(matrix: &DMatrix<f64>) -> bool {
-    // Tolerance for rounding, and for a person who has shortened the numbers. With half of it
-    // numbers shortened to five digits may be refused.
+    /// Tolerance for rounding, and for a person who has shortened the numbers. With half of it
+    /// numbers shortened to five digits may be refused.
     const ABOUT: f64 = 1e-4;
     if !matrix.iter().all(|value| value.abs() < LARGEST) || matrix.diagonal().min() < 0.0 {
         return false;

@@ -73,6 +73,13 @@ pub struct SurveyedLandmark {
     pub clicks: Vec<Click>,
 }
 
+impl SurveyedLandmark {
+    /// Its click in a camera's picture.
+    pub(crate) fn click_of(&self, camera: &CameraName) -> Option<&Click> {
+        self.clicks.iter().find(|click| click.camera == *camera)
+    }
+}
+
 /// Where something was clicked in a camera's picture.
 #[derive(Clone, Debug)]
 pub struct Click {
@@ -85,9 +92,10 @@ pub struct Click {
 }
 
 /// Landmarks in a picture that determine its camera's pose: three are seen alike from up to four
-/// places.
+/// places, and two (half of it) from infinitely many.
 pub(crate) const ENOUGH_FOR_POSE: usize = 4;
-/// Places that determine which way is up, and how large a site is whatever sees them.
+/// Places that determine which way is up, and how large a site is whatever sees them: about the
+/// line through two of them a site may turn.
 pub(crate) const ENOUGH_PLACES: usize = 3;
 
 impl Survey {
@@ -117,23 +125,23 @@ impl Survey {
     }
 
     /// Whether it determines the size of the site of these cameras.
-    pub fn tells_size(&self, cameras: &[&CameraName]) -> bool {
+    pub fn determines_size(&self, cameras: &[&CameraName]) -> bool {
         let stands = |place: &&SurveyedPlace| cameras.contains(&&place.camera);
-        let are_there = |distance: &TapedDistance| {
-            distance.between.iter().all(|camera| cameras.contains(&camera))
-        };
+        let mut taped = self.distances.iter().map(|distance| &distance.between);
         self.places.iter().filter(stands).count() > 1
-            || self.distances.iter().any(are_there)
-            || self.telling_landmarks(cameras) >= ENOUGH_PLACES
+            || taped.any(|between| between.iter().all(|camera| cameras.contains(&camera)))
+            || self.placing_landmarks(cameras) >= ENOUGH_PLACES
     }
 
     /// Number of landmarks that tell these cameras where they are: those that two of them see, and
     /// those of a camera that sees enough for its pose.
-    pub(crate) fn telling_landmarks(&self, cameras: &[&CameraName]) -> usize {
-        self.placed_landmarks().filter(|(landmark, _)| self.tells(landmark, cameras)).count()
+    pub(crate) fn placing_landmarks(&self, cameras: &[&CameraName]) -> usize {
+        self.placed_landmarks()
+            .filter(|(landmark, _)| self.places_cameras(landmark, cameras))
+            .count()
     }
 
-    fn tells(&self, landmark: &SurveyedLandmark, cameras: &[&CameraName]) -> bool {
+    fn places_cameras(&self, landmark: &SurveyedLandmark, cameras: &[&CameraName]) -> bool {
         let by: Vec<&CameraName> = landmark
             .clicks
             .iter()
@@ -144,10 +152,7 @@ impl Survey {
     }
 
     fn landmarks_seen_by(&self, camera: &CameraName) -> usize {
-        let in_picture = |landmark: &SurveyedLandmark| {
-            landmark.clicks.iter().any(|click| click.camera == *camera)
-        };
-        self.placed_landmarks().filter(|(landmark, _)| in_picture(landmark)).count()
+        self.placed_landmarks().filter(|(landmark, _)| landmark.click_of(camera).is_some()).count()
     }
 
     /// Landmarks with a place, and not only a direction.

@@ -1,4 +1,4 @@
-//! Two calibrations of a site held against each other.
+//! Two calibrations of a site compared with each other.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 

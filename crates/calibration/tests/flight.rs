@@ -24,7 +24,8 @@ fn poses_clocks_and_lenses_are_found_from_nothing_but_labels_and_a_log() {
     assert!(result.refused.is_empty());
     for (index, truth) in truths.iter().enumerate() {
         let found = &result.cameras[index];
-        // One label errs by 0.37 mrad; the file's lens is off by up to 6 mrad at the image's border.
+        // One label errs by 0.37 mrad; the file's lens is off by up to 6 mrad at the image's
+        // border.
         let error = pointing_error_mrad(truth, &result, index);
         assert!(error < 0.25, "{}: {error} mrad", truth.name);
         let ratio = truth.camera.model().intrinsics().fx / truth.file.fx;
@@ -75,8 +76,8 @@ fn the_poses_covariance_is_honest() {
     assert!((2.0..9.0).contains(&mean), "{mean}: {squares:?}");
 }
 
-/// The part of a camera's pose that is off with the whole site: turned by w about its middle, it turns
-/// by R'w about its own axes.
+/// The part of a camera's pose that is off with the whole site: turned by w about its middle, it
+/// turns by R'w about its own axes.
 fn of_site(result: &FlightResult, camera: &Camera) -> Matrix6<f64> {
     let datum = result.datum.as_ref().unwrap();
     let arm = camera.pose().position() - datum.middle;
@@ -186,8 +187,8 @@ fn survey(truths: &[Truth], random: &mut ChaCha8Rng) -> Survey {
     Survey { places: truths.iter().map(place).collect(), ..Survey::default() }
 }
 
-/// With nothing but where the cameras stand: their clocks differ by seconds, nobody knows where they
-/// look or where the target was.
+/// With nothing but where the cameras stand: their clocks differ by seconds, nobody knows where
+/// they look or where the target was.
 #[test]
 fn an_unknown_flight_and_three_surveyed_places_give_poses_clocks_and_lenses() {
     let (truths, labels, _) = flight(8);
@@ -304,8 +305,8 @@ fn a_taped_distance_gives_the_size_and_level_cameras_which_way_is_up() {
     assert!(matches!(error, FlightError::NoPair), "{error}");
 }
 
-/// A log that lies metres beside puts the whole site beside and leaves the cameras where they are to
-/// one another; the datum says so, the cameras' covariances do not.
+/// A log that lies metres beside puts the whole site beside and leaves the cameras where they are
+/// to one another; the datum says so, the cameras' covariances do not.
 #[test]
 fn a_log_beside_itself_moves_the_datum_and_not_the_cameras_to_one_another() {
     const BESIDE: [f64; 3] = [1.6, -2.3, 1.1];

@@ -59,8 +59,8 @@ fn survey(landmarks: Vec<SurveyedLandmark>) -> Survey {
     Survey { landmarks, ..Survey::default() }
 }
 
-/// Neither a log nor a place of a camera: two cameras that see marks bring the third, which sees none,
-/// to where they are.
+/// Neither a log nor a place of a camera: two cameras that see marks bring the third, which sees
+/// none, to where they are.
 #[test]
 fn an_unknown_flight_and_landmarks_in_two_pictures_place_all_cameras() {
     let (truths, labels, _) = flight(21);
@@ -219,12 +219,12 @@ fn only_landmarks_that_tell_something_are_counted() {
     let all = survey(clicked(&truths, &[0, 1], 270));
     let names = truths.iter().map(|truth| truth.name.parse().unwrap()).collect::<Vec<_>>();
     let of = |indices: &[usize]| indices.iter().map(|k| &names[*k]).collect::<Vec<_>>();
-    assert!(all.tells_size(&of(&[0, 1, 2])) && all.tells_size(&of(&[0])));
-    assert!(!all.tells_size(&of(&[2])));
+    assert!(all.determines_size(&of(&[0, 1, 2])) && all.determines_size(&of(&[0])));
+    assert!(!all.determines_size(&of(&[2])));
     let mut one_each = clicked(&truths, &[0, 1, 2], 271);
     one_each.truncate(3);
     for (index, landmark) in one_each.iter_mut().enumerate() {
         landmark.clicks.retain(|click| click.camera == names[index]);
     }
-    assert!(!survey(one_each).tells_size(&of(&[0, 1, 2])));
+    assert!(!survey(one_each).determines_size(&of(&[0, 1, 2])));
 }

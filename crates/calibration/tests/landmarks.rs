@@ -1,4 +1,4 @@
-//! Poses by landmarks: pictures are simulated, and what is found is held against the truth.
+//! Poses by landmarks: pictures are simulated, and what is found is compared with the truth.
 
 #![allow(
     clippy::unwrap_used,
@@ -286,8 +286,8 @@ fn what_does_not_suffice_is_refused() {
     assert!(matches!(error, LandmarkError::NoSolution { .. }), "{error}");
 }
 
-/// What turns all stars together turns the camera, and is in its covariance: mean of the rotation's three
-/// squared errors in deviations 3, known to 0.17 by 200 pictures.
+/// What turns all stars together turns the camera, and is in its covariance: mean of the rotation's
+/// three squared errors in deviations 3, known to 0.17 by 200 pictures.
 #[test]
 fn a_turn_of_the_sky_is_in_the_rotation_s_covariance() {
     let mut random = Random::of(11);

@@ -76,7 +76,8 @@ fn a_camera_that_was_moved_since_is_proposed_where_it_is_now() {
     assert!(error < 2.0 && error < 4.0 * turn, "{error} mrad are left, {turn} are said");
 }
 
-/// A straight way at one height, which tells no poses by itself: from any place on a circle it looks the same.
+/// A straight way at one height, which tells no poses by itself: from any place on a circle it
+/// looks the same.
 fn straight(t: f64) -> Point3<f64> {
     Point3::new(-25.0 + 0.42 * t, 12.0 - 0.17 * t, 38.0)
 }
@@ -87,7 +88,8 @@ fn level(t: f64) -> Point3<f64> {
     Point3::new(place.x, place.y, 36.0)
 }
 
-/// What was known tells what two cameras and a flight do not: how they stand, and that nothing has changed.
+/// What was known tells what two cameras and a flight do not: how they stand, and that nothing has
+/// changed.
 #[test]
 fn two_cameras_and_a_flight_that_tells_no_poses_leave_what_was_known() {
     let (truths, site) = earlier();

@@ -73,10 +73,10 @@ fn errors(truths: &[Truth], result: &FlightResult) -> Vec<f64> {
     truths.iter().enumerate().map(|(k, truth)| pointing_error_mrad(truth, result, k)).collect()
 }
 
-/// A second drone for a tenth of the time, half of it and all of it, and somebody who flies by; every
-/// thing is lost and found again six times in each camera. Calibrated by one of the two: cameras point to 2 mrad
-/// as by a flight of one drone, or to as much as they say where less of it was joined, and the labels of the
-/// others are counted.
+/// A second drone for a tenth of the time, half of it and all of it, and somebody who flies by;
+/// every thing is lost and found again six times in each camera. Calibrated by one of the two:
+/// cameras point to 2 mrad as by a flight of one drone, or to as much as they say where less of it
+/// was joined, and the labels of the others are counted.
 #[test]
 fn several_drones_calibrate_as_one_does() {
     for (seed, share) in [(11, 0.1), (12, 0.5), (13, 0.5), (14, 1.0), (15, 1.0)] {
@@ -138,8 +138,8 @@ fn turned_mrad(truths: &[Truth], labels: &[CameraLabels]) -> f64 {
     turn_vector(&(truth.inverse() * found)).norm() * 1e3
 }
 
-/// Two cameras and two drones are as good as two cameras and one (9 mrad, as what a lens' file is off by turns
-/// two cameras): a drone is not taken for the other.
+/// Two cameras and two drones are as good as two cameras and one (9 mrad, as what a lens' file is
+/// off by turns two cameras): a drone is not taken for the other.
 #[test]
 fn two_cameras_tell_two_drones_apart() {
     let truths: Vec<Truth> = cameras().into_iter().take(2).collect();

@@ -16,11 +16,14 @@ pub enum Route {
     Spectral,
 }
 
-/// Cost model of the two routes, ns: `DIRECT_NS` per multiply-add of the direct route,
-/// `SPECTRAL_NS` per `n log2 n` of a transform of `n` samples. Measured by
-/// `cargo bench -p crossfix-correlation`; only their ratio matters, and near the crossing either
-/// route will do. With half of one, the slower route is taken where it costs at most twice as much.
+/// Cost of the direct route per multiply-add, ns. Measured by `cargo bench -p
+/// crossfix-correlation`; only its ratio to [`SPECTRAL_NS`] matters, and near the crossing either
+/// route will do. With half of it the direct route is chosen where it costs up to twice as much as
+/// the other.
 const DIRECT_NS: f64 = 0.027;
+/// Cost of the spectral route per `n log2 n` of a transform of `n` samples, ns, measured in the
+/// same way. With half of it the spectral route is chosen where it costs up to twice as much as the
+/// other.
 const SPECTRAL_NS: f64 = 0.30;
 
 /// Sides, in samples, of the pieces into which the spectral route cuts a large gate: transforms of

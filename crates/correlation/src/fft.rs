@@ -82,6 +82,29 @@ pub(crate) struct Transform {
 }
 
 impl Transform {
+    fn planned(size: Size, real: &mut RealFftPlanner<f32>, complex: &mut FftPlanner<f32>) -> Self {
+        let row_forward = real.plan_fft_forward(size.width);
+        let row_inverse = real.plan_fft_inverse(size.width);
+        let column_forward = complex.plan_fft_forward(size.height);
+        let column_inverse = complex.plan_fft_inverse(size.height);
+        let scratch = [
+            row_forward.get_scratch_len(),
+            row_inverse.get_scratch_len(),
+            column_forward.get_inplace_scratch_len(),
+            column_inverse.get_inplace_scratch_len(),
+        ];
+        Self {
+            size,
+            row: vec![0.0; size.width],
+            rows: vec![Complex::default(); ROWS_AT_ONCE * (size.width / 2 + 1)],
+            scratch: vec![Complex::default(); scratch.into_iter().max().unwrap_or(0)],
+            row_forward,
+            row_inverse,
+            column_forward,
+            column_inverse,
+        }
+    }
+
     fn half(&self) -> usize {
         self.size.width / 2 + 1
     }
@@ -167,27 +190,6 @@ impl Default for Transforms {
 impl Transforms {
     pub(crate) fn of(&mut self, size: Size) -> &mut Transform {
         let Self { real, complex, made } = self;
-        made.entry(size).or_insert_with(|| {
-            let row_forward = real.plan_fft_forward(size.width);
-            let row_inverse = real.plan_fft_inverse(size.width);
-            let column_forward = complex.plan_fft_forward(size.height);
-            let column_inverse = complex.plan_fft_inverse(size.height);
-            let scratch = [
-                row_forward.get_scratch_len(),
-                row_inverse.get_scratch_len(),
-                column_forward.get_inplace_scratch_len(),
-                column_inverse.get_inplace_scratch_len(),
-            ];
-            Transform {
-                size,
-                row: vec![0.0; size.width],
-                rows: vec![Complex::default(); ROWS_AT_ONCE * (size.width / 2 + 1)],
-                scratch: vec![Complex::default(); scratch.into_iter().max().unwrap_or(0)],
-                row_forward,
-                row_inverse,
-                column_forward,
-                column_inverse,
-            }
-        })
+        made.entry(size).or_insert_with(|| Transform::planned(size, real, complex))
     }
 }

@@ -16,7 +16,8 @@ const LEAST_SHARE: f64 = 1e-9;
 /// Information on a given contrast over that which the image gives on it. With half of it the same:
 /// the fitted contrast is within millionths of the given one.
 const KNOWN: f64 = 1e6;
-/// Number of planes in a fit: model, its derivatives by the four freedoms, image.
+/// Number of planes in a fit: model, its derivatives by the four freedoms, image. It follows from
+/// the model.
 const PLANES: usize = 6;
 
 /// Parameters that are fitted, beside contrast and brightness.

@@ -5,7 +5,8 @@ use pulp::{Arch, Simd, WithSimd};
 
 use crate::Plane;
 
-/// Samples per axis from which an interpolated value is computed.
+/// Samples per axis from which an interpolated value is computed: a cubic has four coefficients.
+/// With half of it the interpolation would be linear, and its gradient would jump at the samples.
 const TAPS: usize = 4;
 
 /// The weights of the four samples around a place that lies `fraction` of a sample after the second
@@ -132,7 +133,7 @@ impl Resampler {
     /// cubic convolution. Its size is that of `to`; beyond the plane's border the border samples
     /// are repeated.
     pub fn sample(&mut self, from: &Plane, left: f64, top: f64, to: &mut Plane) {
-        let (fx, fy) = self.support(from, left, top, to);
+        let [fx, fy] = self.support(from, left, top, to);
         self.passes(weights(fx), weights(fy), to);
     }
 
@@ -148,13 +149,13 @@ impl Resampler {
 
     /// Copies the samples that support an interpolated part to `self.part`; returns the fractions
     /// of its place along x and y.
-    fn support(&mut self, from: &Plane, left: f64, top: f64, to: &Plane) -> (f32, f32) {
+    fn support(&mut self, from: &Plane, left: f64, top: f64, to: &Plane) -> [f32; 2] {
         let ((x, fx), (y, fy)) = (split(left), split(top));
         let (width, height) = (to.width() + TAPS - 1, to.height() + TAPS - 1);
         // One sample before and two after each place.
         from.crop_into(x - 1, y - 1, width, height, &mut self.part);
         self.lines.reshape(to.width(), height);
-        (fx, fy)
+        [fx, fy]
     }
 }
 
@@ -215,7 +216,7 @@ impl PlaneSpline {
         to.by_y.reshape(width, height);
         // The coefficients begin MARGIN samples before the image.
         let margin = MARGIN as f64;
-        let (fx, fy) =
+        let [fx, fy] =
             resampler.support(&self.coefficients, left + margin, top + margin, &to.value);
         let Resampler { part, lines } = resampler;
         Arch::new().dispatch(GradientPasses { part, fx, fy, lines, to });
@@ -308,12 +309,17 @@ impl Resampler {
             view.y - corner[1] - sin * half[0] - cos * half[1],
         ];
         let step = [cos as f32, sin as f32];
-        Arch::new().dispatch(Turned { part: &self.part, start: start.map(|s| s as f32), step, to });
+        Arch::new().dispatch(TurnedRows {
+            part: &self.part,
+            start: start.map(|s| s as f32),
+            step,
+            to,
+        });
     }
 }
 
 /// Linear interpolation along turned rows.
-struct Turned<'a> {
+struct TurnedRows<'a> {
     part: &'a Plane,
     /// Where the first sample lies.
     start: [f32; 2],
@@ -322,7 +328,7 @@ struct Turned<'a> {
     to: &'a mut Plane,
 }
 
-impl WithSimd for Turned<'_> {
+impl WithSimd for TurnedRows<'_> {
     type Output = ();
 
     #[inline(always)]

@@ -6,7 +6,7 @@ use anyhow::{Context, ensure};
 use crossfix_calibration::{CalibratedCamera, SiteCalibration};
 use crossfix_geometry::{Camera, Pixel};
 use crossfix_message::{
-    BearingFrame, CameraCalibration, CameraName, ImageTrackState, Preview, Timestamp,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, ImageTrackState, Preview, Timestamp,
 };
 
 /// Reads a site's calibration file.
@@ -17,6 +17,16 @@ pub fn load(path: &Path) -> anyhow::Result<SiteCalibration> {
         .with_context(|| format!("the calibration {} has an error", path.display()))?;
     ensure!(!site.cameras().is_empty(), "the calibration {} has no cameras", path.display());
     Ok(site)
+}
+
+/// That a site's file lacks a camera, and which it has.
+fn lacks_camera(path: &Path, site: &SiteCalibration, name: &CameraName) -> String {
+    let known: Vec<&str> = site.cameras().iter().map(|camera| camera.name.as_str()).collect();
+    format!(
+        "the calibration {} has no camera `{name}`: it has {}",
+        path.display(),
+        known.join(", ")
+    )
 }
 
 /// One camera of a site's calibration.
@@ -30,14 +40,7 @@ impl Calibrated {
     /// Reads the site's file and picks the camera of this name.
     pub fn load(path: &Path, name: &CameraName) -> anyhow::Result<Self> {
         let site = load(path)?;
-        let camera = site.camera(name).cloned().with_context(|| {
-            let known: Vec<&str> = site.cameras().iter().map(|c| c.name.as_str()).collect();
-            format!(
-                "the calibration {} has no camera `{name}`: it has {}",
-                path.display(),
-                known.join(", ")
-            )
-        })?;
+        let camera = site.camera(name).cloned().with_context(|| lacks_camera(path, &site, name))?;
         Ok(Self { site, camera })
     }
 
@@ -97,25 +100,27 @@ pub fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
     frame.capture_time_ns = time.nanos();
     frame.capture_time_sd_s = frame.capture_time_sd_s.hypot(sd_s);
     let before = frame.tracks.len();
-    frame.tracks.retain_mut(|track| {
-        let Ok(bearing) = camera.bearing(Pixel::new(track.pixel_x, track.pixel_y)) else {
-            return false;
-        };
-        track.bearing = Some(bearing.direction().into_inner().into());
-        track.covariance_xx = bearing.covariance().m11;
-        track.covariance_xy = bearing.covariance().m12;
-        track.covariance_yy = bearing.covariance().m22;
-        true
-    });
+    frame.tracks.retain_mut(|track| set_bearing(track, camera));
     (before - frame.tracks.len()) as u64
 }
 
-/// The image row whose read-out time is taken as the frame's time: the mean row of its targets.
+/// Computes a track's bearing from its pixel; `false` if the pixel has none.
+fn set_bearing(track: &mut BearingTrack, camera: &CalibratedCamera) -> bool {
+    let Ok(bearing) = camera.bearing(Pixel::new(track.pixel_x, track.pixel_y)) else {
+        return false;
+    };
+    track.bearing = Some(bearing.direction().into_inner().into());
+    track.covariance_xx = bearing.covariance().m11;
+    track.covariance_xy = bearing.covariance().m12;
+    track.covariance_yy = bearing.covariance().m22;
+    true
+}
+
+/// The image row whose read-out time is used as the frame's time: the mean row of its targets.
 fn middle_row(frame: &BearingFrame, camera: &CalibratedCamera) -> f64 {
     let height = f64::from(camera.camera.model().intrinsics().size.height);
-    let is_seen =
-        |track: &&crossfix_message::BearingTrack| track.state() == ImageTrackState::Tracking;
-    let rows: Vec<f64> = frame.tracks.iter().filter(is_seen).map(|track| track.pixel_y).collect();
+    let seen = frame.tracks.iter().filter(|track| track.state() == ImageTrackState::Tracking);
+    let rows: Vec<f64> = seen.map(|track| track.pixel_y).collect();
     if rows.is_empty() { height / 2.0 } else { rows.iter().sum::<f64>() / rows.len() as f64 }
 }
 

@@ -139,7 +139,7 @@ impl Centre {
             self.repeats
                 .warn("nothing found", Instant::now(), || format!("nothing is found: {why}"));
         }
-        if self.poses.look(&self.fusion) {
+        if self.poses.check(&self.fusion) {
             for (camera, problem) in self.poses.problems() {
                 self.repeats.warn(&format!("moved {camera}"), Instant::now(), || problem);
             }

@@ -45,11 +45,11 @@ pub struct WatchedCertificate {
 impl WatchedCertificate {
     pub fn new(own: OwnCertificate) -> Self {
         let mut watched = Self { own, looked_at: Instant::now(), problem: None };
-        watched.look();
+        watched.check();
         watched
     }
 
-    fn look(&mut self) {
+    fn check(&mut self) {
         self.looked_at = Instant::now();
         let problem = self.own.problem(SystemTime::now());
         if let Some(problem) = problem.as_ref().filter(|_| self.problem.is_none()) {
@@ -61,7 +61,7 @@ impl WatchedCertificate {
     /// The certificate's current problem, if any.
     pub fn problem(&mut self) -> Option<String> {
         if self.looked_at.elapsed() >= CERTIFICATE_PERIOD {
-            self.look();
+            self.check();
         }
         self.problem.clone()
     }
@@ -103,7 +103,7 @@ impl HealthReporter {
         let (run, host) = (self.run, network::host());
         let mut problems = health.problems;
         problems.extend(self.certificate.as_mut().and_then(WatchedCertificate::problem));
-        Health { run, host, rate_hz, load: self.host.look(), problems, ..health }
+        Health { run, host, rate_hz, load: self.host.measure(), problems, ..health }
     }
 
     /// Publishes a report.

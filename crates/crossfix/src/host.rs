@@ -8,7 +8,7 @@ use sysinfo::{Components, Pid, ProcessRefreshKind, ProcessesToUpdate, System};
 /// Measures the load of this process and its host once a second.
 #[derive(Debug, Default)]
 pub struct HostWatch {
-    /// `None` where the system does not tell.
+    /// `None` where the system does not say.
     system: Option<System>,
     parts: Option<Components>,
     /// When it was measured last, and the process's processor time (CPU time) by then.
@@ -16,14 +16,14 @@ pub struct HostWatch {
 }
 
 impl HostWatch {
-    /// Starts measuring; the load is available from the second look on.
+    /// Starts measuring; the load is available from the second measurement on.
     pub fn start() -> Self {
         let parts = Components::new_with_refreshed_list();
         Self { system: System::new().ok(), parts: parts.ok(), before: None }
     }
 
-    /// Load since the previous look; `None` where the system does not tell.
-    pub fn look(&mut self) -> Option<HostLoad> {
+    /// Load since the previous measurement; `None` where the system does not say.
+    pub fn measure(&mut self) -> Option<HostLoad> {
         let system = self.system.as_mut()?;
         let own = Pid::from_u32(std::process::id());
         system.refresh_cpu_usage();
@@ -55,7 +55,7 @@ fn hottest(parts: &mut Components) -> Option<f64> {
     read.filter(|celsius| celsius.is_finite()).map(f64::from).max_by(f64::total_cmp)
 }
 
-/// How far off the host's clock may be, as the program that disciplines the clock has told the
+/// How far off the host's clock may be, as the program that disciplines the clock has set in the
 /// kernel; `None` where no program does. Such programs tell the kernel every few seconds to
 /// minutes; in between the kernel adds half a millisecond per second, and reports the clock as
 /// unsynchronised once that has come to 16 s.
@@ -85,11 +85,11 @@ mod tests {
     #[test]
     fn a_process_that_works_is_seen_to_work() {
         let mut watch = HostWatch::start();
-        let first = watch.look().unwrap();
+        let first = watch.measure().unwrap();
         assert!(first.process_memory > 1 << 20 && first.memory_available > 1 << 20, "{first:?}");
         let until = Instant::now() + Duration::from_millis(500);
         while Instant::now() < until {}
-        let load = watch.look().unwrap();
+        let load = watch.measure().unwrap();
         // Other tests of this process may run at the same time.
         assert!(load.process_cores > 0.3, "{load:?}");
         assert!((0.0..=1.0).contains(&load.cores_in_use), "{load:?}");

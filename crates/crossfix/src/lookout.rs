@@ -2,13 +2,14 @@
 
 use std::time::{Duration, Instant};
 
-use crossfix_message::{CameraName, Channel, Key};
+use crossfix_message::{AreaName, CameraName, Channel, Key, SiteName};
 use crossfix_transport::{Link, NetworkConfig, OwnCertificate, Presence};
 
-/// How long a component may be missing before that is logged, and how often it is repeated while
-/// none is present. With half of the first a component that is starting is said to be missing; with
-/// half of the second a camera that is alone logs twice as much.
+/// How long a component may be missing before that is logged. With half of it a component that is
+/// starting is said to be missing.
 const PATIENCE: Duration = Duration::from_secs(3);
+/// How often it is logged again while none is present. With half of it a camera that is alone logs
+/// twice as much.
 const PERIOD: Duration = Duration::from_secs(60);
 /// Most names in a line; the rest is given as a number. With half as many the fifth and further
 /// ones would not be named.
@@ -61,7 +62,7 @@ struct Other {
     endpoint: String,
     key: Key,
     is_here: bool,
-    /// Whether it was present at the previous look, too.
+    /// Whether it was present at the previous check, too.
     was_here: bool,
     /// Whether it was ever present.
     has_been_here: bool,
@@ -70,6 +71,16 @@ struct Other {
 impl Other {
     fn new(name: String, endpoint: String, key: Key) -> Self {
         Self { name, endpoint, key, is_here: false, was_here: false, has_been_here: false }
+    }
+
+    /// The fusion centre of an area, or the only one.
+    fn centre(site: &SiteName, area: Option<AreaName>, endpoint: &str) -> Self {
+        let name = match &area {
+            None => "the fusion centre".to_owned(),
+            Some(area) => format!("the fusion centre of area `{area}`"),
+        };
+        let key = Key::of_centre(site.clone(), area, Channel::FusionAlive);
+        Self::new(name, endpoint.to_owned(), key)
     }
 }
 
@@ -94,16 +105,9 @@ impl Lookout {
         network: &NetworkConfig,
         camera: &CameraName,
     ) -> anyhow::Result<Self> {
-        let hear = network.centres_of(camera);
-        let centres = network.centres().filter(|(area, _)| hear.contains(area));
-        let centres = centres.map(|(area, endpoint)| {
-            let name = area.as_ref().map_or_else(
-                || "the fusion centre".to_owned(),
-                |area| format!("the fusion centre of area `{area}`"),
-            );
-            let key = Key::of_centre(link.site().clone(), area, Channel::FusionAlive);
-            Other::new(name, endpoint.to_owned(), key)
-        });
+        let needed = network.centres_of(camera);
+        let centres = network.centres().filter(|(area, _)| needed.contains(area));
+        let centres = centres.map(|(area, endpoint)| Other::centre(link.site(), area, endpoint));
         Self::new(link, centres.collect())
     }
 
@@ -114,7 +118,7 @@ impl Lookout {
     }
 
     /// Checks again who is present; to be called about once a second.
-    pub fn look(&mut self, now: Instant) {
+    pub fn check(&mut self, now: Instant) {
         let mut changed = false;
         for other in &mut self.others {
             let is_here = self.presence.is_alive(&other.key);

@@ -83,8 +83,8 @@ fn main() -> ExitCode {
     }
 }
 
-/// The command with options that take negative numbers: one that nobody can mean is refused with its
-/// range, and not taken for an option.
+/// The command with options that take negative numbers: one that makes no sense is refused with its
+/// range, and not read as an option.
 fn takes_negative_numbers(command: clap::Command) -> clap::Command {
     let options = command.mut_args(|argument| {
         let takes = argument.get_action().takes_values() && !argument.is_positional();

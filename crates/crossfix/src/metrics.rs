@@ -18,7 +18,7 @@ use crate::http;
 /// network may fail.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
 /// A report older than this means that the component no longer reports its health. They are due
-/// every second: with half of it one that is held up for three seconds would seem dead.
+/// every second: with half of it one that is delayed by three seconds would seem dead.
 const STALE: Duration = Duration::from_secs(5);
 
 /// The metrics page; it disappears when the process ends.

@@ -6,10 +6,11 @@ use crossfix_transport::{Link, NetworkConfig, Role, RunId};
 
 use crate::shutdown::Shutdown;
 
-/// How long a router may be silent before that is logged, and how often it is repeated. With half
-/// of the first a router that is starting would be logged as silent; with half of the second a
-/// night without one costs twice as many lines.
+/// How long a router may be silent before that is logged. With half of it a router that is starting
+/// would be logged as silent.
 const PATIENCE: Duration = Duration::from_secs(2);
+/// How often it is logged again. With half of it a night without a router costs twice as many
+/// lines.
 const PERIOD: Duration = Duration::from_secs(60);
 
 /// Number of threads of Zenoh's pools, unless the environment sets it. Zenoh closes the connection

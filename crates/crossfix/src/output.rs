@@ -24,7 +24,7 @@ pub fn json(value: &impl Serialize) -> anyhow::Result<()> {
 #[error("{0}")]
 pub struct Misuse(pub String);
 
-/// Prints why the command failed: the error and its causes, a line each.
+/// Prints why the command failed: the error and its causes, one per line.
 pub fn error(error: &anyhow::Error) {
     let mut stderr = io::stderr().lock();
     let _ = writeln!(stderr, "error: {error}");
@@ -33,8 +33,8 @@ pub fn error(error: &anyhow::Error) {
     }
 }
 
-/// The temporary files that are there now: the process ends without their owners where it is told
-/// to stop and a command does not look.
+/// The temporary files that exist now: where the process is asked to stop and a command does not
+/// check for that, it ends without their owners.
 static DRAFTS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
 /// Removes the files that are not complete; the program is about to end.
@@ -103,11 +103,11 @@ impl Drop for Draft {
     }
 }
 
-/// Most names that are tried for a file whose name is taken. With half as many the 5000th file of
+/// Most names that are tried for a file whose name is in use. With half as many the 5000th file of
 /// one name would be refused.
 const MOST_NAMES: u32 = 10_000;
 
-/// The wanted name, and those tried where it is taken: `today-2.mcap`, `today-3.mcap` ..
+/// The wanted name, and those tried where it is in use: `today-2.mcap`, `today-3.mcap` ..
 pub fn names(asked: &Path) -> impl Iterator<Item = PathBuf> + '_ {
     let stem = asked.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let extension =
@@ -144,25 +144,28 @@ pub fn number(value: Option<f64>, decimals: usize) -> String {
 /// Lines up the columns of a table; the first row is its head.
 pub fn table(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let width = |column: usize| {
-        rows.iter().filter_map(|r| r.get(column)).map(|c| c.chars().count()).max().unwrap_or(0)
-    };
-    let widths: Vec<usize> = (0..columns).map(width).collect();
-    let mut lines: Vec<String> = rows
-        .iter()
-        .map(|row| {
-            let cells = row.iter().zip(&widths).enumerate();
-            let cell = |(column, (text, &width)): (usize, (&String, &usize))| {
-                if column == 0 { format!("{text:<width$}") } else { format!("{text:>width$}") }
-            };
-            cells.map(cell).collect::<Vec<_>>().join("  ").trim_end().to_owned()
-        })
-        .collect();
+    let widths: Vec<usize> = (0..columns).map(|column| width(rows, column)).collect();
+    let mut lines: Vec<String> = rows.iter().map(|row| line_of(row, &widths)).collect();
     if lines.len() > 1 {
         let total = widths.iter().sum::<usize>() + 2 * columns.saturating_sub(1);
         lines.insert(1, "-".repeat(total));
     }
     lines.join("\n")
+}
+
+/// Width of a table's column, in characters.
+fn width(rows: &[Vec<String>], column: usize) -> usize {
+    let cells = rows.iter().filter_map(|row| row.get(column));
+    cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
+}
+
+/// A row of a table: the first column aligned to the left, all others to the right.
+fn line_of(row: &[String], widths: &[usize]) -> String {
+    let mut line = String::new();
+    for (column, (text, &width)) in row.iter().zip(widths).enumerate() {
+        line += &if column == 0 { format!("{text:<width$}") } else { format!("  {text:>width$}") };
+    }
+    line.trim_end().to_owned()
 }
 
 #[cfg(test)]

@@ -47,11 +47,6 @@ impl CameraWatch {
         if found.is_moved {
             self.moved_at.get_or_insert(time);
         }
-        // Certain findings come before uncertain ones, and findings that only this camera explains
-        // before those that another might explain, however strong the evidence there.
-        let rank = |finding: &PoseFinding| {
-            (finding.is_moved, finding.or_else.is_empty(), finding.log_odds)
-        };
         if rank(&found) > rank(&self.worst) {
             (self.worst, self.worst_at) = (found.clone(), time);
         }
@@ -65,9 +60,15 @@ impl CameraWatch {
     }
 }
 
+/// Order of findings: certain ones come before uncertain ones, and those that only this camera
+/// explains before those that another might explain, however strong the evidence there.
+fn rank(finding: &PoseFinding) -> (bool, bool, f64) {
+    (finding.is_moved, finding.or_else.is_empty(), finding.log_odds)
+}
+
 impl PoseWatch {
     /// Asks the fusion if a check is due; returns whether it was.
-    pub fn look(&mut self, fusion: &Fusion) -> bool {
+    pub fn check(&mut self, fusion: &Fusion) -> bool {
         let Some(now) = fusion.now() else { return false };
         let asked = *self.asked.get_or_insert(now);
         let is_due = now.seconds_since(asked).abs() >= ASKED_EVERY_S;

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 /// A warning of one kind is logged at once, then at this interval with the number of repeats. With
 /// half of it one that lasts costs twice as many lines.
 const PERIOD: Duration = Duration::from_secs(60);
-/// Most kinds that are told apart: the names in them come from outside. With half as many all
+/// Most kinds that are distinguished: the names in them come from outside. With half as many all
 /// beyond 500 share one line, and hide each other.
 const MOST_KINDS: usize = 1000;
 

@@ -1,5 +1,5 @@
-//! A camera that looks for the targets that the fusion centre's cues name: where it should point,
-//! and which of the tracks in its image is the target.
+//! A camera that searches for the targets that the fusion centre's cues name: where it should
+//! point, and which of the tracks in its image is the target.
 //!
 //! The wide cameras hand a target over, the narrow one turns there, searches, and locks (Klochko's
 //! first paper, chapter 2). A track is the target if it lies where the cue predicts, in the sum of
@@ -19,7 +19,7 @@ use nalgebra::{Matrix2, Rotation3, Unit, Vector3};
 
 use self::place::{PredictedDirection, long_axis, place_at, squared_distance};
 
-/// Validity of a cue after it came, s of data time: as far as cues look ahead. With half of it a
+/// Validity of a cue after it came, s of data time: as far as cues predict. With half of it a
 /// camera that gets no cue for a second forgets its target.
 const VALID_S: f64 = 2.0;
 /// Gate on the squared Mahalanobis distance of a track from the cue's prediction, with the sum of
@@ -38,7 +38,7 @@ const RUNNER_UP: f64 = 6.0;
 /// turned; with less the head turns all the time.
 const OFF_MIDDLE: f64 = 0.6;
 /// How long a turn takes, s: while the head turns, the target may be further off by its way in this
-/// time. With half of it a head that turns for so long might be told to turn elsewhere on its way.
+/// time. With half of it a head that takes this long might be sent elsewhere on its way.
 const TURN_S: f64 = 1.0;
 /// A turn by less than this fraction of half the view shows nothing new. With half of it the camera
 /// is more often blind for a turn that gains little.
@@ -60,18 +60,18 @@ const SEARCHED_SDS: f64 = 2.0;
 /// many a target farther along a long stripe is never looked at.
 const MOST_VIEWS: i32 = 40;
 /// A track not seen for this long is no longer a candidate, s: a detector misses one now and then.
-/// With half of it the count of its images begins anew after a gap of a third of a second.
+/// With half of it the count of its images starts again after a gap of a third of a second.
 const MISSED_S: f64 = 0.5;
 /// A target found within this time is kept even if there is a cue of a surer target, s: time for a
 /// turn and a stare. With half of it such a target would be left before the next view has been
 /// looked at.
 const FOUND_S: f64 = 4.0;
-/// Most cues, and most times per cue, that are accepted: a fusion centre sends no more. With half
-/// of either the same.
+/// Most cues that are accepted: a fusion centre sends no more. With half of it the same.
 const MOST_CUES: usize = 64;
+/// Most times per cue that are accepted: a fusion centre sends no more. With half of it the same.
 const MOST_TIMES: usize = 16;
 
-/// Where a camera pointed when an image was taken.
+/// Where a camera pointed when an image was exposed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Pointed {
     /// Always the same way: it has no mount.
@@ -103,7 +103,7 @@ pub trait Mount: Send {
 pub struct Orders {
     /// Where the mount should point from now on.
     pub aim: Option<ScanAngles>,
-    /// The camera's track that is the target it was told to look for.
+    /// The camera's track that is the target of the cue.
     pub taken_over: Option<TakenOver>,
 }
 
@@ -141,7 +141,7 @@ pub struct Seeker {
     found: Option<Timestamp>,
     search: Option<Search>,
     holds: bool,
-    /// Where the mount was last told to point.
+    /// The last order to the mount.
     ordered: Option<ScanAngles>,
 }
 
@@ -172,7 +172,7 @@ impl Seeker {
     }
 
     /// Takes in the fusion centre's cues; those beyond the limits are dropped or cut.
-    pub fn hear(&mut self, cues: CueFrame) {
+    pub fn take_cues(&mut self, cues: CueFrame) {
         self.cues = cues;
         self.cues.cues.truncate(MOST_CUES);
         self.cues.cues.retain(|cue| {
@@ -190,10 +190,15 @@ impl Seeker {
 
     /// Orders for the camera, given the tracks of an image, its time by the camera's clock, and
     /// where it pointed then.
-    pub fn look(&mut self, time: Timestamp, pointed: Pointed, tracks: &[BearingTrack]) -> Orders {
+    pub fn observe(
+        &mut self,
+        time: Timestamp,
+        pointed: Pointed,
+        tracks: &[BearingTrack],
+    ) -> Orders {
         let Some((cue, now)) = self.choose(time) else { return Orders::default() };
         self.last = Some(now.direction);
-        let taken = match pointed {
+        let recognised = match pointed {
             Pointed::Fixed => {
                 let at_rest = ScanAngles { azimuth: 0.0, elevation: 0.0 };
                 self.recognise(&now, at_rest, tracks, time)
@@ -201,7 +206,7 @@ impl Seeker {
             Pointed::Settled(angles) => self.recognise(&now, angles, tracks, time),
             Pointed::Unknown | Pointed::Turning(_) => None,
         };
-        if taken.is_some() {
+        if recognised.is_some() {
             self.found = Some(time);
         }
         let mount = self.mount.filter(|_| !self.holds);
@@ -211,7 +216,7 @@ impl Seeker {
             (self.candidate, self.ordered) = (None, aim);
         }
         let taken_over =
-            taken.map(|image_track_id| TakenOver { image_track_id, of: self.of.clone() });
+            recognised.map(|image_track_id| TakenOver { image_track_id, of: self.of.clone() });
         Orders { aim, taken_over }
     }
 
@@ -232,7 +237,7 @@ impl Seeker {
         let same = reached.iter().find(|(cue, _)| cue.of == self.of);
         let same = same.filter(|(cue, _)| is_sure(cue) || is_found || sure().next().is_none());
         // When a single camera's target becomes a track its cue changes its name: the track nearest
-        // to the last direction is taken for it.
+        // to the last direction is assumed to be it.
         let away =
             |place: &PredictedDirection| self.last.map_or(TAU, |last| last.angle(&place.direction));
         let beside = sure().min_by(|a, b| away(&a.1).total_cmp(&away(&b.1)));

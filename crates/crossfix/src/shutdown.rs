@@ -27,7 +27,7 @@ pub const LAST_WORK: Duration = Duration::from_millis(1100);
 /// network learn of the end by silence alone.
 pub const LEAVE: Duration = Duration::from_millis(500);
 /// As [`LEAVE`], for a command that has come to its end by itself: nothing may be lost. With half
-/// of it what a slow receiver has not taken in five seconds would be.
+/// of it what a slow receiver has not received in five seconds would be.
 pub const LONG_LEAVE: Duration = Duration::from_secs(10);
 /// How often it is checked whether the time is up. With half of it the same.
 const POLL: Duration = Duration::from_millis(20);
@@ -46,7 +46,7 @@ struct Asked {
     /// Request to read the configuration again, and whether the command can do that.
     reload: AtomicBool,
     can_reload: AtomicBool,
-    /// Whether the command looks whether it has been asked to stop.
+    /// Whether the command checks whether it has been asked to stop.
     is_heeded: AtomicBool,
 }
 
@@ -65,20 +65,7 @@ impl Shutdown {
 
     /// Listens for Ctrl-C, SIGTERM and SIGHUP; a second signal ends the program at once.
     fn begin() -> Self {
-        let asked = ASKED.get_or_init(|| {
-            let asked = Arc::new(Asked::default());
-            let heard = Arc::clone(&asked);
-            let listening = Signals::new([SIGINT, SIGTERM, SIGHUP]).and_then(|signals| {
-                std::thread::Builder::new()
-                    .name("signals".into())
-                    .spawn(move || heed(signals, &heard))
-            });
-            if let Err(error) = listening {
-                tracing::warn!("cannot listen for Ctrl-C: {error}");
-            }
-            asked
-        });
-        Self(Arc::clone(asked))
+        Self(Arc::clone(ASKED.get_or_init(listen_for_signals)))
     }
 
     /// Makes SIGHUP mean that the configuration is to be read again. Not on a terminal, where it
@@ -118,6 +105,19 @@ impl Shutdown {
     }
 }
 
+/// Starts the thread that listens for signals; without it the program still works.
+fn listen_for_signals() -> Arc<Asked> {
+    let asked = Arc::new(Asked::default());
+    let heard = Arc::clone(&asked);
+    let listening = Signals::new([SIGINT, SIGTERM, SIGHUP]).and_then(|signals| {
+        std::thread::Builder::new().name("signals".into()).spawn(move || heed(signals, &heard))
+    });
+    if let Err(error) = listening {
+        tracing::warn!("cannot listen for Ctrl-C: {error}");
+    }
+    asked
+}
+
 /// Records what signals ask for.
 fn heed(mut signals: Signals, asked: &Asked) {
     let mut is_second = false;
@@ -134,8 +134,8 @@ fn heed(mut signals: Signals, asked: &Asked) {
 }
 
 /// Runs a command, and abandons it if it does not end in time after a request to stop, so that a
-/// hanging disk or a long computation cannot keep the process alive. One that does not look whether
-/// it is asked to stop is abandoned at once, and what it was writing is removed.
+/// hanging disk or a long computation cannot keep the process alive. One that does not check
+/// whether it is asked to stop is abandoned at once, and what it was writing is removed.
 pub fn supervise(
     command: impl FnOnce() -> anyhow::Result<()> + Send + 'static,
 ) -> anyhow::Result<()> {

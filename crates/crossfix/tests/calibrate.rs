@@ -9,6 +9,7 @@ use crossfix_calibration::SiteCalibration;
 use crossfix_geometry::{Camera, Pose};
 use nalgebra::Point3;
 
+/// The file of a camera.
 const NORTH: &str = r#"
 name = "north"
 network = "network.toml"
@@ -23,6 +24,7 @@ source = "ntp"
 sd_s = 0.002
 "#;
 
+/// The file of its lens.
 const LENS: &str = "image_width: 1920\nimage_height: 1080\ncamera_name: north\n\
     camera_matrix: {rows: 3, cols: 3, data: [1460.0, 0.0, 959.5, 0.0, 1460.0, 539.5, 0.0, 0.0, 1.0]}\n\
     distortion_model: plumb_bob\n\
@@ -106,7 +108,7 @@ fn a_new_pose_leaves_the_clock_of_a_flight() {
     let (code, said, log) = by_landmarks(folder.path(), "north");
     assert!(code == Some(0), "{said}{log}");
     let site = SiteCalibration::from_toml(&std::fs::read_to_string(&file).unwrap()).unwrap();
-    assert_eq!(site.cameras()[0].clock.at(30.0).0, -29.8);
+    assert_eq!(site.cameras()[0].clock.at(30.0).ahead_s, -29.8);
     assert_eq!(site.cameras()[0].noise.lasting_px, 0.9);
 }
 

@@ -6,6 +6,7 @@ use std::collections::BTreeSet;
 
 use assert_cmd::Command;
 
+/// All commands, in any order.
 const COMMANDS: [&str; 23] = [
     "demo",
     "agent",
@@ -207,8 +208,8 @@ fn the_site_to_copy_is_good() {
     crossfix().args(["check", "-c", site]).assert().success();
 }
 
-/// A camera of the host that is not there, and one that is no camera, are said with what mends it;
-/// its configuration is held against what cameras can do.
+/// A camera of the host that is not there, and one that is no camera, are reported with the remedy;
+/// its configuration is compared with what cameras can do.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_camera_of_the_host_is_asked_for_by_its_device() {

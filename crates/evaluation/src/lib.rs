@@ -32,7 +32,8 @@ pub use history::TrackHistory;
 pub use latency::{Latency, LatencyRecorder};
 pub use metrics::{Estimate, Evaluator, Nees, Report, TargetReport, TrueTarget};
 pub use papers::{
-    Limit, Table, TableRow, ValidationOptions, Verdict, validate_fusion, validate_tracker,
+    Limit, SampleStatistic, Table, TableRow, ValidationOptions, Verdict, validate_fusion,
+    validate_tracker,
 };
 pub use sightings::Sightings;
 pub use stretches::Delays;

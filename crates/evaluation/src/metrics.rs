@@ -191,12 +191,12 @@ struct TargetScore {
     switches: u64,
 }
 
-/// Counts of answers by their distance from the nearest target; `judged` are those at instants with
-/// any target.
+/// Counts of answers by their distance from the nearest target; `with_truth` are those at instants
+/// with any target.
 #[derive(Clone, Copy, Debug, Default)]
 struct Answers {
     all: u64,
-    judged: u64,
+    with_truth: u64,
     false_ones: u64,
     off_by_1_m: u64,
     beyond_4_sd: u64,
@@ -205,19 +205,19 @@ struct Answers {
 impl Answers {
     fn add(&mut self, truth: &[TrueTarget], estimate: &Estimate, cutoff: f64) {
         self.all += 1;
-        let away = |target: &TrueTarget| (estimate.state.position() - target.position).norm();
+        let away = |target: &TrueTarget| distance(target, estimate);
         let Some(nearest) = truth.iter().map(away).min_by(f64::total_cmp) else {
             self.false_ones += 1;
             return;
         };
-        self.judged += 1;
+        self.with_truth += 1;
         self.false_ones += u64::from(nearest >= cutoff);
         self.off_by_1_m += u64::from(nearest > FAR_OFF_M);
         self.beyond_4_sd += u64::from(nearest > SIGMAS * estimate.position_sd_m());
     }
 
     fn share(&self, count: u64) -> Option<f64> {
-        (self.judged > 0).then(|| count as f64 / self.judged as f64)
+        (self.with_truth > 0).then(|| count as f64 / self.with_truth as f64)
     }
 }
 
@@ -299,9 +299,7 @@ impl Evaluator {
         if truth.is_empty() {
             return Vec::new();
         }
-        let distance = |row: usize, column: usize| {
-            (estimates[column].state.position() - truth[row].position).norm()
-        };
+        let distance = |row: usize, column: usize| distance(&truth[row], &estimates[column]);
         // One extra column per target, at the cut-off's cost, leaves the target unpaired.
         let columns = estimates.len() + truth.len();
         let weights = Matrix::from_fn(truth.len(), columns, |(row, column)| {
@@ -310,10 +308,9 @@ impl Evaluator {
             (relative.min(1.0).powi(2) * COST_SCALE) as i64
         });
         let (_, column_of) = kuhn_munkres_min(&weights);
-        let near = |(row, column): (usize, usize)| {
-            (column < estimates.len() && distance(row, column) < self.cutoff).then_some(column)
-        };
-        column_of.into_iter().enumerate().map(near).collect()
+        let is_near = |row, column| column < estimates.len() && distance(row, column) < self.cutoff;
+        let pairs = column_of.into_iter().enumerate();
+        pairs.map(|(row, column)| is_near(row, column).then_some(column)).collect()
     }
 
     /// Figures of all instants so far.
@@ -347,6 +344,11 @@ impl Evaluator {
             targets: self.targets.iter().map(|(&id, target)| target_report(id, target)).collect(),
         }
     }
+}
+
+/// Distance of an estimate from a target, m.
+fn distance(truth: &TrueTarget, estimate: &Estimate) -> f64 {
+    (estimate.state.position() - truth.position).norm()
 }
 
 fn target_report(id: u64, target: &TargetScore) -> TargetReport {

@@ -19,8 +19,8 @@ fn row<'a>(tables: &'a [Table], name: &str, series: &str) -> &'a TableRow {
 fn targets_are_followed_and_what_is_no_target_is_not_shown_for_one() {
     let tables = ablate_drawn(OPTIONS, &[TrackerPart::Arrival], |_, _, _| ());
     // Frames lost, %; masts and clouds also hide the target. Sixteen scenes of each kind of another
-    // seed lose 9, 4 and 10 % in the mean, with standard errors for four of 5, 1.3 and 6. In noise a
-    // scene is lost as a whole or not at all.
+    // seed lose 9, 4 and 10 % in the mean, with standard errors for four of 5, 1.3 and 6. In noise
+    // a scene is lost as a whole or not at all.
     for (kind, most) in [("noise", 30.0), ("masts", 25.0), ("wires", 10.0), ("edges", 18.0)] {
         let all = row(&tables, &format!("ablation-{kind}"), "all parts");
         assert!(all.ours < most, "{kind}: {:.1} % of the frames are lost", all.ours);

@@ -34,8 +34,8 @@ fn the_delays_cost_two_receivers_metres_and_three_nothing() {
         let row = rows.iter().find(|row| row.series == series && row.x == delay);
         row.expect("the row is there").ours
     };
-    assert!(of("two receivers, m = 1, noise on M", 0.25) > 2.0);
-    assert!(of("three receivers, m = 1, noise on M", 0.3) < 0.2);
+    assert!(of("two receivers, m = 1, noise on positions", 0.25) > 2.0);
+    assert!(of("three receivers, m = 1, noise on positions", 0.3) < 0.2);
 }
 
 #[test]

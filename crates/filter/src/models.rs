@@ -1,19 +1,22 @@
 //! Motion models of targets, and the rates of change between them. "Calm" models are those in which
 //! targets fly for long; each time a target leaves them is an "upset".
 
-/// Greatest number of models: more say nothing that fewer do not.
+/// Greatest number of models: more say nothing that fewer do not. With half of it there is no model
+/// between calm flight and the hardest manoeuvre.
 pub const MAX_MODELS: usize = 4;
 
 /// A target counts as having left calm flight when the probability of calm is below this: when it
 /// is more likely not calm. At half of this value only hard manoeuvres would count, ...
 const UPSET: f64 = 0.5;
 /// ... and it counts as calm again when the probability of calm is above this. Well above the
-/// other, so that one manoeuvre during which the probability goes up and down counts once.
+/// other, so that one manoeuvre during which the probability goes up and down counts once; at half
+/// of it, below the other, each crossing would count.
 const CALM: f64 = 0.9;
 
 /// Number of upsets added to those seen, where an axis of the target's motion is not observed:
 /// Jeffreys' prior of a rate. The mean rate over all targets is right only on average, and where an
-/// axis is not observed nothing shows in time that it was wrong for this target.
+/// axis is not observed nothing shows in time that it was wrong for this target. With half of it a
+/// target that has never been upset is expected to be upset half as often.
 const UNSEEN_UPSETS: f64 = 0.5;
 
 /// A motion model: constant velocity driven by white acceleration.
@@ -205,6 +208,7 @@ pub(crate) struct Restlessness {
 }
 
 impl Restlessness {
+    /// Of a target that nothing is known of: calm, with no upset and no time seen yet.
     pub(crate) const UNKNOWN: Self = Self { is_calm: true, upsets: 0.0, calm_s: 0.0 };
 
     /// The rate, 1/s, with `more` upsets than have been seen; `usual` is the mean rate over all

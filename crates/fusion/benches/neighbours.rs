@@ -1,5 +1,6 @@
-//! What it costs an area's fusion centre to have neighbours: a second in which each of two says so many
-//! targets 90 times, as by three cameras of 30 Hz that all see them, half of them in the strip that both see.
+//! What it costs an area's fusion centre to have neighbours: a second in which each of two says so
+//! many targets 90 times, as by three cameras of 30 Hz that all see them, half of them in the strip
+//! that both see.
 //!
 //! `cargo bench -p crossfix-fusion --bench neighbours`
 
@@ -50,8 +51,8 @@ fn a_second_of_so_many_targets(bencher: Bencher, targets: usize) {
         .with_inputs(|| (Neighbours::new(share, &FusionConfig::default()), ours.clone()))
         .bench_values(|(mut neighbours, ours)| {
             for (ours, theirs) in ours.into_iter().zip(&theirs) {
-                neighbours.hear(1, theirs);
-                divan::black_box(neighbours.pass(vec![Output::Tracks(ours)]));
+                neighbours.receive(1, theirs);
+                divan::black_box(neighbours.forward(vec![Output::Tracks(ours)]));
             }
         });
 }

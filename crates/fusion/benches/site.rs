@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use crossfix_fusion::{Fusion, FusionConfig, Initiation, Track, TrackId};
+use crossfix_fusion::{FusedTrack, Fusion, FusionConfig, Initiation, TrackId};
 use crossfix_message::Timestamp;
 use crossfix_simulation::{Layout, SimulatedSite, Site, SiteExposure, TargetState};
 
@@ -110,12 +110,13 @@ impl Quality {
     /// Compares the confirmed tracks with the truth at a time: the nearest pairs first.
     fn look(&mut self, site: &SimulatedSite, fusion: &Fusion, t: f64, counts: bool) {
         let now = Timestamp::from_seconds(t);
-        let tracks: Vec<&Track> = fusion.tracks().filter(|track| track.is_confirmed()).collect();
+        let tracks: Vec<&FusedTrack> =
+            fusion.tracks().filter(|track| track.is_confirmed()).collect();
         let truth: Vec<TargetState> = site.truth(t).collect();
         let mut pairs = Vec::new();
         for (i, track) in tracks.iter().enumerate() {
             let state = track.state();
-            let place = state.position() + state.velocity() * now.seconds_since(track.updated);
+            let place = state.position() + state.velocity() * now.seconds_since(track.updated_at);
             for (k, target) in truth.iter().enumerate() {
                 let apart = (place - target.position).norm();
                 if apart < MATCH_M {
@@ -147,7 +148,7 @@ impl Quality {
             self.epochs += 1;
             self.expected += expected.len();
             self.found += reached;
-            let alone: Vec<&Track> = tracks
+            let alone: Vec<&FusedTrack> = tracks
                 .iter()
                 .zip(&target_of)
                 .filter(|(_, k)| k.is_none())
@@ -176,8 +177,8 @@ impl Quality {
 }
 
 /// Whether a target lies within four standard deviations of where a track believes itself to be.
-fn near_for_its_covariance(track: &Track, now: Timestamp, truth: &[TargetState]) -> bool {
-    let state = track.state().predicted(now.seconds_since(track.updated), 1.0);
+fn near_for_its_covariance(track: &FusedTrack, now: Timestamp, truth: &[TargetState]) -> bool {
+    let state = track.state().predicted(now.seconds_since(track.updated_at), 1.0);
     let Some(covariance) = state.position_covariance().cholesky() else {
         return false;
     };
@@ -290,7 +291,7 @@ fn run(case: &Case) {
 
 /// A ring of cameras about an area of 600 m by 600 m, at 30 Hz.
 fn ring(targets: usize, cameras: usize, duration_s: f64) -> Site {
-    Site { targets, cameras, duration_s, clutter: 5.0, ..Site::default() }
+    Site { targets, cameras, duration_s, false_bearings: 5.0, ..Site::default() }
 }
 
 /// Cameras over a whole town, each of which sees what is near.
@@ -305,7 +306,7 @@ fn wide(targets: usize, seed: u64) -> (Site, FusionConfig) {
         range_m,
         rate_hz: 10.0,
         duration_s: 10.0,
-        clutter: 5.0,
+        false_bearings: 5.0,
         ..Site::default()
     };
     let initiation = Initiation { max_range_m: range_m, ..Initiation::default() };

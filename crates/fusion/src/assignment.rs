@@ -1,6 +1,6 @@
 //! Assignment of rows to columns with the greatest total gain.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use pathfinding::prelude::{Matrix, kuhn_munkres};
 
@@ -21,16 +21,13 @@ pub(crate) struct Pairing {
     pub(crate) gain: f64,
 }
 
-/// The pairs (row, column) of greatest total gain, ordered by row; a gain of 0 and less is never
-/// taken.
+/// The column of each row that gets one, in the pairing of greatest total gain; a gain of 0 and
+/// less is never chosen.
 ///
 /// Candidates that touch no other's row or column decide themselves; only clusters of several are
 /// solved as a whole, so the cost grows with the clusters and not with the site.
-pub(crate) fn assign(candidates: &[Pairing]) -> Vec<(usize, usize)> {
-    let mut pairs: Vec<(usize, usize)> =
-        clusters(candidates).iter().flat_map(|cluster| solve(cluster)).collect();
-    pairs.sort_unstable();
-    pairs
+pub(crate) fn assign(candidates: &[Pairing]) -> BTreeMap<usize, usize> {
+    clusters(candidates).iter().flat_map(|cluster| solve(cluster)).collect()
 }
 
 /// Groups of candidates that are linked through rows and columns.
@@ -60,9 +57,9 @@ fn clusters(candidates: &[Pairing]) -> Vec<Vec<Pairing>> {
     clusters.into_values().collect()
 }
 
-fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
+fn solve(cluster: &[Pairing]) -> BTreeMap<usize, usize> {
     if let [only] = cluster {
-        return vec![(only.row, only.column)];
+        return BTreeMap::from([(only.row, only.column)]);
     }
     let rows = distinct(cluster.iter().map(|candidate| candidate.row));
     let columns = distinct(cluster.iter().map(|candidate| candidate.column));
@@ -78,8 +75,8 @@ fn solve(cluster: &[Pairing]) -> Vec<(usize, usize)> {
         }
     }
     let (_, column_of) = kuhn_munkres(&gains);
-    let taken = column_of.into_iter().enumerate();
-    taken
+    let chosen = column_of.into_iter().enumerate();
+    chosen
         .filter(|&(row, column)| column < columns.len() && gains[(row, column)] > 0)
         .map(|(row, column)| (rows[row], columns[column]))
         .collect()
@@ -93,23 +90,19 @@ fn distinct(indices: impl Iterator<Item = usize>) -> Vec<usize> {
     indices
 }
 
-fn greedy(cluster: &[Pairing]) -> Vec<(usize, usize)> {
+fn greedy(cluster: &[Pairing]) -> BTreeMap<usize, usize> {
     // Equal gains in the order of rows and columns: that of the candidates must decide nothing.
     let mut by_gain = cluster.to_vec();
     by_gain.sort_by(|a, b| {
         b.gain.total_cmp(&a.gain).then(a.row.cmp(&b.row)).then(a.column.cmp(&b.column))
     });
-    let (mut rows, mut columns) =
-        (std::collections::BTreeSet::new(), std::collections::BTreeSet::new());
-    let mut pairs = Vec::new();
-    for candidate in by_gain {
-        if !rows.contains(&candidate.row) && !columns.contains(&candidate.column) {
-            rows.insert(candidate.row);
-            columns.insert(candidate.column);
-            pairs.push((candidate.row, candidate.column));
+    let (mut column_of, mut columns) = (BTreeMap::new(), BTreeSet::new());
+    for Pairing { row, column, .. } in by_gain {
+        if !column_of.contains_key(&row) && columns.insert(column) {
+            column_of.insert(row, column);
         }
     }
-    pairs
+    column_of
 }
 
 #[cfg(test)]
@@ -118,7 +111,7 @@ mod tests {
 
     fn all(gains: &[(usize, usize, f64)]) -> Vec<(usize, usize)> {
         let candidate = |&(row, column, gain): &(usize, usize, f64)| Pairing { row, column, gain };
-        assign(&gains.iter().map(candidate).collect::<Vec<_>>())
+        assign(&gains.iter().map(candidate).collect::<Vec<_>>()).into_iter().collect()
     }
 
     #[test]
@@ -141,7 +134,7 @@ mod tests {
             .flat_map(|r| (0..side).map(move |c| (r, c, 1.0 + ((r * 7 + c * 13) % 50) as f64)))
             .collect();
         let pairs = all(&gains);
-        let columns: std::collections::BTreeSet<usize> = pairs.iter().map(|p| p.1).collect();
+        let columns: BTreeSet<usize> = pairs.iter().map(|p| p.1).collect();
         assert_eq!((pairs.len(), columns.len()), (side, side));
     }
 }

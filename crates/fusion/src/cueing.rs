@@ -23,7 +23,8 @@ use crate::uncertainty::{CameraUncertainty, SharedTies};
 /// flies at 20 m/s moves by 20 mrad. With half of it twice as many messages tell of 10 mrad each.
 const EVERY_S: f64 = 0.1;
 /// Times ahead for which a cue predicts the bearing, s: far enough for a head that turns for a
-/// second and gets no new cue for another.
+/// second and gets no new cue for another. With half of each such a head has nothing to turn to in
+/// that second.
 const AHEAD_S: [f64; 5] = [0.0, 0.25, 0.5, 1.0, 2.0];
 /// Most targets in one cue message: a camera looks for one at a time, and the one that it is on
 /// must be among them. With half of it a camera that is on the 17th nearest is no longer told of
@@ -184,11 +185,11 @@ fn seen(
 ) -> Option<(Unit<Vector3<f64>>, Matrix2<f64>)> {
     let places = match seen_from.and_then(|from| StateChart::by_range(from, state)) {
         Some(chart) => along_range(&chart, state),
-        None => vec![(1.0, state.position(), state.position_covariance())],
+        None => vec![WeightedPlace::of(state)],
     };
     let models: Vec<_> = places
         .into_iter()
-        .filter_map(|(weight, place, spread)| {
+        .filter_map(|WeightedPlace { weight, place, spread }| {
             Some((weight, BearingModel::new(origin, place)?, spread))
         })
         .collect();
@@ -210,16 +211,29 @@ fn seen(
     Some((direction, covariance))
 }
 
-/// Positions along an uncertain range, with their weights and the remaining covariance of each
-/// position once the range is given.
-fn along_range(
-    chart: &StateChart,
-    state: &KinematicState,
-) -> Vec<(f64, Point3<f64>, Matrix3<f64>)> {
+/// A place where the target may be.
+#[derive(Clone, Copy, Debug)]
+struct WeightedPlace {
+    weight: f64,
+    place: Point3<f64>,
+    /// Covariance of the place, m^2.
+    spread: Matrix3<f64>,
+}
+
+impl WeightedPlace {
+    /// The one place of a state.
+    fn of(state: &KinematicState) -> Self {
+        Self { weight: 1.0, place: state.position(), spread: state.position_covariance() }
+    }
+}
+
+/// Positions along an uncertain range, each with the covariance that remains once the range is
+/// given.
+fn along_range(chart: &StateChart, state: &KinematicState) -> Vec<WeightedPlace> {
     let (covariance, _) = chart.expressed(&state.covariance, &SharedTies::zeros());
     let variance = covariance.m33;
     if variance <= 0.0 {
-        return vec![(1.0, state.position(), state.position_covariance())];
+        return vec![WeightedPlace::of(state)];
     }
     let tied: Vector6<f64> = covariance.column(2).into_owned();
     // Given the log range: mean c x / sqrt(v) at node x, covariance P - c c' / v, where c is the
@@ -228,7 +242,8 @@ fn along_range(
     let places = NODES.map(|(node, weight)| {
         let point = chart.point(&(tied * (node / variance.sqrt())));
         let left = left.fixed_view::<3, 3>(0, 0);
-        (weight, point.place, point.place_by * left * point.place_by.transpose())
+        let spread = point.place_by * left * point.place_by.transpose();
+        WeightedPlace { weight, place: point.place, spread }
     });
     places.to_vec()
 }

@@ -9,17 +9,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use crossfix_message::{CameraName, Timestamp};
 
 use crate::{EventTime, Exposure, Rejection, RejectionReason};
-use stream::Stream;
+use stream::FrameStream;
 
 pub(crate) use queue::ReorderQueue;
 
 /// Most exposures that are remembered of those that were released: memory is bounded. With half of
 /// it the same at the default lateness, within which 64 cameras of 60 Hz send 1920; beyond it what
 /// comes twice passes for late.
-const MAX_TAKEN: usize = 20_000;
+const MAX_RELEASED_KEYS: usize = 20_000;
 
 /// A camera that has been silent for this many times the lateness is not waited for. With half of
-/// it, a second by default, cameras that send less than a frame a second are not.
+/// it, a second by default, cameras that send less than one frame per second are not.
 const PATIENCES: f64 = 4.0;
 
 /// Of the time that one camera's clock alone says has gone by, this share is believed. With all of
@@ -38,19 +38,19 @@ pub(crate) enum ExposureArrival {
 
 /// A camera that should be heard: its stream once it has been, and whether it has come to its end.
 #[derive(Clone, Copy, Debug, Default)]
-struct Source {
-    stream: Option<Stream>,
+struct ExpectedCamera {
+    stream: Option<FrameStream>,
     ended: bool,
 }
 
 /// The buffer that puts exposures into order.
 ///
-/// The reference is the time of the second newest of the live cameras, and no more than half of
+/// The agreed time is that of the second newest of the live cameras, and no more than half of
 /// them may be beyond what the others have reached. So a minority of wrong clocks cannot drag the
 /// others into the past. Exposures are released up to the time of the slowest camera that is still
-/// heard, or up to `lateness_s` behind the reference, whichever is later.
+/// heard, or up to `lateness_s` behind the agreed time, whichever is later.
 ///
-/// Frames that are refused count for the reference too: where most cameras jump, time has jumped.
+/// Frames that are refused count for the agreed time too: where most cameras jump, time has jumped.
 /// If most of them have been behind what was released for a while, the release was the mistake, and
 /// the order starts again from their time.
 ///
@@ -76,24 +76,24 @@ pub(crate) struct EventBuffer {
     waiting: ReorderQueue<bool>,
     /// What was released within the last `lateness_s`, to tell what comes twice from what comes
     /// late.
-    taken: BTreeSet<(Timestamp, CameraName)>,
-    sources: BTreeMap<CameraName, Source>,
+    released_keys: BTreeSet<(Timestamp, CameraName)>,
+    sources: BTreeMap<CameraName, ExpectedCamera>,
     /// How far time has gone on, s.
     run_s: f64,
     /// The time that the live cameras agree on, and how many they were, when a frame last came.
-    reference: Option<CommonTime>,
+    agreed: Option<CommonTime>,
     /// [`Self::run_s`] since which most live cameras have been behind what was released.
     behind_since_s: Option<f64>,
     /// Exposures that were waiting when the order started again.
     dropped: Vec<Rejection>,
     /// Where the order started again, until somebody asks.
-    restarted: Option<Timestamp>,
+    rewound_to: Option<Timestamp>,
     /// The oldest time heard.
     first: Option<Timestamp>,
     /// The newest time that was released.
     released: Timestamp,
     /// The newest time, with the clock's offset taken off, that has been worked on.
-    passed: Timestamp,
+    processed: Timestamp,
 }
 
 /// Common time of the live cameras, and how many there are.
@@ -108,16 +108,16 @@ impl EventBuffer {
         Self {
             config,
             waiting: ReorderQueue::default(),
-            taken: BTreeSet::new(),
+            released_keys: BTreeSet::new(),
             sources: BTreeMap::new(),
             run_s: 0.0,
-            reference: None,
+            agreed: None,
             behind_since_s: None,
             dropped: Vec::new(),
-            restarted: None,
+            rewound_to: None,
             first: None,
             released: Timestamp::MIN,
-            passed: Timestamp::MIN,
+            processed: Timestamp::MIN,
         }
     }
 
@@ -136,17 +136,17 @@ impl EventBuffer {
         if let Some(source) = self.sources.get_mut(&exposure.camera) {
             source.ended = false;
         }
-        let is_taken = self.taken.contains(&(time, exposure.camera.clone()));
-        if is_taken || self.waiting.holds(&exposure, time) {
+        let is_released = self.released_keys.contains(&(time, exposure.camera.clone()));
+        if is_released || self.waiting.holds(&exposure, time) {
             return Err(RejectionReason::Duplicate);
         }
         let arrival = self.observe(&exposure);
-        let compared = self.reference.is_some_and(|reference| reference.live > 1);
-        if let Some(reference) = self.reference
+        let compared = self.agreed.is_some_and(|agreed| agreed.live > 1);
+        if let Some(agreed) = self.agreed
             && let Some(stream) = self.stream_mut(&exposure.camera)
         {
             // A camera that goes on by itself, step by step, is not from the future.
-            let by_s = time.seconds_since(reference.time.max(stream.trusted));
+            let by_s = time.seconds_since(agreed.time.max(stream.trusted));
             if by_s > max_ahead_s {
                 return Err(RejectionReason::Future { by_s });
             }
@@ -161,17 +161,17 @@ impl EventBuffer {
         Ok(arrival)
     }
 
-    fn stream_mut(&mut self, camera: &CameraName) -> Option<&mut Stream> {
+    fn stream_mut(&mut self, camera: &CameraName) -> Option<&mut FrameStream> {
         self.sources.get_mut(camera)?.stream.as_mut()
     }
 
     /// The streams of all cameras that have been heard, each with whether it has come to its end.
-    fn streams(&self) -> impl Iterator<Item = (&Stream, bool)> {
+    fn streams(&self) -> impl Iterator<Item = (&FrameStream, bool)> {
         self.sources.values().filter_map(|source| Some((source.stream.as_ref()?, source.ended)))
     }
 
     /// The streams that have not come to their end.
-    fn going_on(&self) -> impl Iterator<Item = &Stream> {
+    fn going_on(&self) -> impl Iterator<Item = &FrameStream> {
         self.streams().filter(|(_, ended)| !ended).map(|(stream, _)| stream)
     }
 
@@ -180,7 +180,7 @@ impl EventBuffer {
         let (time, lateness_s) = (exposure.time, self.config.lateness_s);
         let late_s = self.late_s(exposure);
         let source = self.sources.entry(exposure.camera.clone()).or_default();
-        let stream = source.stream.get_or_insert(Stream::beginning(time));
+        let stream = source.stream.get_or_insert(FrameStream::beginning(time));
         let arrival = if time < stream.newest {
             ExposureArrival::OutOfOrder
         } else {
@@ -188,7 +188,7 @@ impl EventBuffer {
         };
         // A clock that races makes nobody else look silent, nor does one that catches up on lost
         // time.
-        let reached = self.reference.map(|reference| reference.time.plus_seconds(-lateness_s));
+        let reached = self.agreed.map(|agreed| agreed.time.plus_seconds(-lateness_s));
         let keeps_up = reached.is_none_or(|reached| time > reached);
         let step_s = time.seconds_since(stream.newest).clamp(0.0, lateness_s);
         stream.gone_s += stream.progress(keeps_up, step_s);
@@ -220,7 +220,7 @@ impl EventBuffer {
 
     /// Notes the cameras that are further behind than anybody waits.
     fn note_who_is_behind(&mut self) {
-        let Some(CommonTime { time, .. }) = self.reference else { return };
+        let Some(CommonTime { time, .. }) = self.agreed else { return };
         let (patience, run_s) = (time.plus_seconds(-self.config.lateness_s), self.run_s);
         for stream in self.sources.values_mut().filter_map(|source| source.stream.as_mut()) {
             let since_s = stream.behind_since_s.unwrap_or(run_s);
@@ -230,14 +230,14 @@ impl EventBuffer {
 
     /// The time that the live cameras agree on; `None` before any was heard.
     pub(crate) fn agreed_time(&self) -> Option<Timestamp> {
-        self.reference.map(|reference| reference.time)
+        self.agreed.map(|agreed| agreed.time)
     }
 
-    /// Computes the reference from the live cameras.
+    /// Computes the agreed time from the live cameras.
     fn estimate_now(&mut self) {
         let patience_s = PATIENCES * self.config.lateness_s;
-        let is_live = |stream: &&Stream| self.run_s - stream.heard_s <= patience_s;
-        let live: Vec<&Stream> = self.going_on().filter(is_live).collect();
+        let is_live = |stream: &&FrameStream| self.run_s - stream.heard_s <= patience_s;
+        let live: Vec<&FrameStream> = self.going_on().filter(is_live).collect();
         let newest = newest_first(live.iter().map(|stream| stream.newest));
         // The time that a camera has reached: its next frame is not due before.
         let reached = newest_first(live.iter().map(|s| s.newest.plus_seconds(s.step_s)));
@@ -250,33 +250,33 @@ impl EventBuffer {
         };
         let is_behind = |time: &Timestamp| self.released.seconds_since(*time) > patience_s;
         let behind = newest.iter().filter(|time| is_behind(time)).count();
-        self.reference = time.map(|time| CommonTime { time, live: live.len() });
+        self.agreed = time.map(|time| CommonTime { time, live: live.len() });
         if behind <= half {
             self.behind_since_s = None;
             return;
         }
         let since_s = *self.behind_since_s.get_or_insert(self.run_s);
         if let Some(time) = time.filter(|_| self.run_s - since_s > patience_s) {
-            self.restart(time);
+            self.rewind(time);
         }
     }
 
     /// Starts the order again from a time before what was released.
-    fn restart(&mut self, time: Timestamp) {
+    fn rewind(&mut self, time: Timestamp) {
         while let Some((exposure, _)) = self.waiting.pop() {
             let by_s = exposure.time.seconds_since(time);
             self.dropped.push(exposure.refused(RejectionReason::Future { by_s }));
         }
-        self.taken.clear();
+        self.released_keys.clear();
         let streams = self.sources.values_mut().filter_map(|source| source.stream.as_mut());
         streams.for_each(|stream| stream.trusted = Timestamp::MIN);
         self.behind_since_s = None;
-        (self.released, self.passed) = (Timestamp::MIN, Timestamp::MIN);
-        self.restarted = Some(time);
+        (self.released, self.processed) = (Timestamp::MIN, Timestamp::MIN);
+        self.rewound_to = Some(time);
     }
 
     /// Forgets all times, as the clocks of all cameras have stepped. Nothing is kept waiting.
-    pub(crate) fn begin_anew(&mut self) {
+    pub(crate) fn reset(&mut self) {
         let mut sources = std::mem::take(&mut self.sources);
         sources.retain(|_, source| source.ended || source.stream.is_some());
         sources.values_mut().for_each(|source| source.stream = None);
@@ -285,27 +285,27 @@ impl EventBuffer {
 
     /// The time at which the order started again with the last frame, if it did: what has been made
     /// of later times is to be forgotten.
-    pub(crate) fn take_restart(&mut self) -> Option<Timestamp> {
-        self.restarted.take()
+    pub(crate) fn take_rewind(&mut self) -> Option<Timestamp> {
+        self.rewound_to.take()
     }
 
     /// By how much an exposure comes too late, s: what follows it has been worked on. What was
     /// released may still wait until other clocks are sure (by its time less the clock's offset).
     fn late_s(&self, exposure: &Exposure) -> Option<f64> {
         let corrected = exposure.time.plus_seconds(-exposure.correction_s);
-        let is_late = exposure.time < self.released && corrected < self.passed;
+        let is_late = exposure.time < self.released && corrected < self.processed;
         is_late.then(|| self.released.seconds_since(exposure.time))
     }
 
     /// Notes that an exposure of this time, less the clock's offset, is being worked on.
     pub(crate) fn mark_processed(&mut self, corrected: Timestamp) {
-        self.passed = self.passed.max(corrected);
+        self.processed = self.processed.max(corrected);
     }
 
     /// By how much a time, less the clock's offset, lies before what has been worked on, s; `None`
     /// unless that is more than the lateness.
-    pub(crate) fn passed_by_s(&self, corrected: Timestamp) -> Option<f64> {
-        Some(self.passed.seconds_since(corrected)).filter(|by_s| *by_s > self.config.lateness_s)
+    pub(crate) fn behind_processed_s(&self, corrected: Timestamp) -> Option<f64> {
+        Some(self.processed.seconds_since(corrected)).filter(|by_s| *by_s > self.config.lateness_s)
     }
 
     /// Marks a camera as come to its end: nobody waits for it any more.
@@ -335,8 +335,8 @@ impl EventBuffer {
     /// that of other cameras.
     fn take(&mut self, exposure: Exposure, is_compared: bool) -> Result<Exposure, Rejection> {
         // A frame taken in before a second camera was heard may turn out to be from the future.
-        if !is_compared && let Some(reference) = self.reference {
-            let ahead = exposure.time.seconds_since(reference.time);
+        if !is_compared && let Some(agreed) = self.agreed {
+            let ahead = exposure.time.seconds_since(agreed.time);
             if ahead > self.config.max_ahead_s {
                 return Err(exposure.refused(RejectionReason::Future { by_s: ahead }));
             }
@@ -347,12 +347,12 @@ impl EventBuffer {
     }
 
     fn remember(&mut self, time: Timestamp, camera: CameraName) {
-        self.taken.insert((time, camera));
+        self.released_keys.insert((time, camera));
         let oldest = self.released.plus_seconds(-self.config.lateness_s);
-        while self.taken.len() > MAX_TAKEN
-            || self.taken.first().is_some_and(|(time, _)| *time < oldest)
+        while self.released_keys.len() > MAX_RELEASED_KEYS
+            || self.released_keys.first().is_some_and(|(time, _)| *time < oldest)
         {
-            self.taken.pop_first();
+            self.released_keys.pop_first();
         }
     }
 
@@ -363,10 +363,10 @@ impl EventBuffer {
             return Some(Timestamp::MAX);
         }
         let lateness_s = self.config.lateness_s;
-        let CommonTime { time: reference, live } = self.reference?;
-        let patience = reference.plus_seconds(-lateness_s);
-        let forgotten = reference.plus_seconds(-PATIENCES * lateness_s);
-        let is_expected = |source: &Source| source.stream.is_none() && !source.ended;
+        let CommonTime { time: agreed, live } = self.agreed?;
+        let patience = agreed.plus_seconds(-lateness_s);
+        let forgotten = agreed.plus_seconds(-PATIENCES * lateness_s);
+        let is_expected = |source: &ExpectedCamera| source.stream.is_none() && !source.ended;
         let waits_for_new = self.first.is_some_and(|first| first > forgotten)
             && self.sources.values().any(is_expected);
         // A camera alone is not followed at once: the others may come back, or be heard at last.

@@ -1,9 +1,9 @@
 //! The fusion centre as a state machine: bearing frames in, track frames, events and cues out.
 //!
 //! The way of a frame, in the order of the calls: read into an exposure (`ingress.rs`), its clock
-//! corrected (`clocks/`, `fusion/correcting.rs`), put in order (`event_time.rs`), its bearings given
-//! to the tracks that they fit (`tracker/`), the rest to new ones (`initiation/`); what the exposure
-//! shows of its camera (`cameras/`), and what is said of it all (`fusion/saying.rs`).
+//! corrected (`clocks/`, `fusion/correcting.rs`), put in order (`event_time.rs`), its bearings
+//! given to the tracks that they fit (`tracker/`), the rest to new ones (`initiation/`); what the
+//! exposure shows of its camera (`cameras/`), and what is said of it all (`fusion/saying.rs`).
 //!
 //! It has no clock, thread or file, so that a recording gives the tracks of the live run, bit for
 //! bit.
@@ -28,7 +28,7 @@ use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::MotionSetup;
 use crate::site_time::{FrameDecision, SiteTime, moved};
-use crate::track::Track;
+use crate::track::FusedTrack;
 use crate::tracker::{TrackChange, Tracker, UsedSighting};
 use correcting::SaidTime;
 use smoothing::Smoothing;
@@ -55,7 +55,7 @@ pub enum Output {
     Camera(CameraName, Standing),
 }
 
-/// The fusion centre's judgement of a camera.
+/// The fusion centre's assessment of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraReport {
     /// The camera.
@@ -195,8 +195,8 @@ impl Fusion {
                 // not evidence of a clock that is wrong for ten seconds.
                 let now = self.buffer.agreed_time().unwrap_or(time);
                 self.note_time(&camera, now, in_time, outputs);
-                if let Some(time) = self.buffer.take_restart() {
-                    self.restart(time, outputs);
+                if let Some(time) = self.buffer.take_rewind() {
+                    self.rewind(time, outputs);
                 }
                 match arrival {
                     Ok(ExposureArrival::InOrder) => {}
@@ -227,7 +227,7 @@ impl Fusion {
         outputs
     }
 
-    /// The judgement of each camera, ordered by name.
+    /// The assessment of each camera, ordered by name.
     pub fn cameras(&self) -> impl Iterator<Item = CameraReport> + '_ {
         self.cameras.iter().map(|(name, camera)| CameraReport {
             camera: name.clone(),
@@ -263,7 +263,7 @@ impl Fusion {
     }
 
     /// All tracks after the newest exposure handled, ordered by id.
-    pub fn tracks(&self) -> impl Iterator<Item = &Track> {
+    pub fn tracks(&self) -> impl Iterator<Item = &FusedTrack> {
         self.tracker.tracks()
     }
 
@@ -329,7 +329,7 @@ impl Fusion {
             self.tracker.turn_camera(&exposure.camera);
         }
         let mut exposure = exposure.clone();
-        camera.tell(&mut exposure, self.config.tracking.clutter_per_sr);
+        camera.annotate(&mut exposure, self.config.tracking.clutter_per_sr);
         let mut changes = Vec::new();
         let (fittings, used) = if camera.is_excluded() {
             self.counters.count("exposures_of_excluded_cameras");
@@ -376,7 +376,7 @@ impl Fusion {
         } else {
             unmet.see(&rest).into_iter().for_each(|name| counters.count(name));
         }
-        for start in initiator.add(rest, &step.claims, cameras, tracker.motion()) {
+        for start in initiator.add(rest, &step.provisional, cameras, tracker.motion()) {
             changes.extend(tracker.adopt(start, cameras));
         }
         for start in initiator.hand_over(exposure, &step.used, known, tracker.motion()) {
@@ -412,12 +412,12 @@ impl Fusion {
         fittings: &Fittings,
         outputs: &mut Vec<Output>,
     ) {
-        let judgement = self.cameras.judge(&exposure.camera, exposure.time, fittings);
-        if judgement.suspects_clock {
+        let assessment = self.cameras.assess(&exposure.camera, exposure.time, fittings);
+        if assessment.suspects_clock {
             // Bearings that are compared but not used can show this too.
             self.clocks.suspect(&exposure.camera);
         }
-        if let Some(standing) = judgement.standing {
+        if let Some(standing) = assessment.standing {
             self.counters.count(match standing {
                 Standing::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
@@ -437,7 +437,7 @@ impl Fusion {
         let changed = self.cameras.get_mut(camera).and_then(|known| known.note_time(time, in_time));
         if let Some(standing) = changed {
             if standing == Standing::Excluded {
-                self.site_time.doubt(camera);
+                self.site_time.forget_steps(camera);
             }
             self.counters.count(match standing {
                 Standing::Excluded => "cameras_out_of_time",

@@ -7,7 +7,7 @@ use crossfix_geometry::{Bearing, Camera, GeometryError, SightLine};
 use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, Timestamp};
 use nalgebra::Matrix2;
 
-use crate::cameras::{KnownCamera, Pointed, Rooted};
+use crate::cameras::{KnownCamera, ReportedPointing, Rooted};
 use crate::track::TrackBearing;
 use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
@@ -39,7 +39,7 @@ pub struct Exposure {
     /// The uncertainty that all its bearings share.
     pub(crate) uncertainty: CameraUncertainty,
     /// Where its mount pointed, if it has one.
-    pub(crate) pointed: Option<Pointed>,
+    pub(crate) pointed: Option<ReportedPointing>,
     /// Density of the camera's false bearings (clutter), 1/sr.
     pub(crate) clutter_per_sr: f64,
     /// The clock's offset that has been subtracted from the reported time, s.
@@ -168,11 +168,14 @@ fn sighting(
 }
 
 /// The direction in which the mount of a frame's camera pointed; `None` without a mount.
-fn pointed(frame: &BearingFrame, known: &KnownCamera) -> Result<Option<Pointed>, RejectionReason> {
+fn pointed(
+    frame: &BearingFrame,
+    known: &KnownCamera,
+) -> Result<Option<ReportedPointing>, RejectionReason> {
     if known.mount.is_none() {
         return Ok(None);
     }
-    let said = frame.pointing.as_ref().and_then(Pointed::read);
+    let said = frame.pointing.as_ref().and_then(ReportedPointing::read);
     said.map(Some).ok_or(RejectionReason::Pointing)
 }
 

@@ -6,7 +6,7 @@
 //! what follows from each; the same frames give the same output, bit for bit.
 //!
 //! Inside: bearings that belong to known tracks update them one exposure at a
-//! time ([`Track`], interacting models of iterated extended Kalman filters);
+//! time ([`FusedTrack`], interacting models of iterated extended Kalman filters);
 //! the others are gathered into observation periods, in which sets of them
 //! start hypotheses that are followed until one explanation of the bearings is
 //! by far the best. The papers' method can be chosen instead ([`papers`]).
@@ -88,6 +88,6 @@ pub use counters::Counters;
 pub use fusion::{CameraReport, Fusion, Output};
 pub use ingress::{Exposure, Rejection, RejectionReason, Sighting};
 pub use neighbours::{Neighbours, Share};
-pub use track::{MeasurementResidual, Track, TrackId, TrackStatus};
+pub use track::{FusedTrack, MeasurementResidual, TrackId, TrackStatus};
 pub use uncertainty::pose_covariance_of_careful_survey;
 pub use unmet::{UnmetLines, WhyNothing};

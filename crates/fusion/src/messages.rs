@@ -5,7 +5,7 @@ use crossfix_message::{CameraResidual, Payload, Timestamp, TrackEvent, TrackStat
 
 use crate::motion::MotionSetup;
 use crate::spatial::Quantity;
-use crate::track::{Track, TrackStatus};
+use crate::track::{FusedTrack, TrackStatus};
 use crate::tracker::TrackChange;
 
 /// The message of an event of a track.
@@ -22,7 +22,7 @@ pub(crate) fn event(change: TrackChange, time: Timestamp) -> TrackEvent {
 
 /// The message of a track, with its state predicted to `time`.
 pub(crate) fn track(
-    track: &Track,
+    track: &FusedTrack,
     time: Timestamp,
     motion: &MotionSetup,
 ) -> crossfix_message::Track {
@@ -47,7 +47,7 @@ pub(crate) fn track(
         solver: track.solver.into(),
         rank: track.observability.rank as u32,
         condition_number: track.observability.condition_number,
-        updated_ns: track.updated.nanos(),
+        updated_ns: track.updated_at.nanos(),
         born_ns: track.born.nanos(),
         weak_position_axis: weak_axis(track, Quantity::Position),
         weak_velocity_axis: weak_axis(track, Quantity::Velocity),
@@ -58,7 +58,7 @@ pub(crate) fn track(
 }
 
 /// The axis of a quantity that cannot be observed, if the track's worst determined one is of it.
-fn weak_axis(track: &Track, quantity: Quantity) -> Option<crossfix_message::Vector3> {
+fn weak_axis(track: &FusedTrack, quantity: Quantity) -> Option<crossfix_message::Vector3> {
     let axis = track.observability.weak_axis.filter(|axis| axis.quantity == quantity)?;
     Some(axis.direction.into_inner().into())
 }

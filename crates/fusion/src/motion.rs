@@ -77,7 +77,7 @@ impl MotionSetup {
         if ranged { &self.models } else { &self.unranged }
     }
 
-    /// Mean density of the acceleration over all models of a track that is held, m^2/s^3.
+    /// Mean density of the acceleration over all models of a triangulated track, m^2/s^3.
     pub(crate) fn density(&self, probabilities: &[f64]) -> f64 {
         self.models.models().iter().zip(probabilities).map(|(model, p)| model.density * p).sum()
     }

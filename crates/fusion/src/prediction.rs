@@ -93,13 +93,14 @@ impl BearingFit {
         renewed: Option<Self>,
         probability: f64,
     ) -> Option<Self> {
-        let weighed = |fit: Option<Self>, probability: f64| {
-            fit.map(|fit| Self { log_density: fit.log_density + probability.ln(), ..fit })
-        };
-        [weighed(known, 1.0 - probability), weighed(renewed, probability)]
-            .into_iter()
-            .flatten()
-            .max_by(|a, b| a.log_density.total_cmp(&b.log_density))
+        let known = known.map(|fit| fit.weighed(1.0 - probability));
+        let renewed = renewed.map(|fit| fit.weighed(probability));
+        let both = [known, renewed].into_iter().flatten();
+        both.max_by(|a, b| a.log_density.total_cmp(&b.log_density))
+    }
+
+    fn weighed(self, probability: f64) -> Self {
+        Self { log_density: self.log_density + probability.ln(), ..self }
     }
 }
 
@@ -140,7 +141,9 @@ impl BearingPrediction {
             model,
             factor: uncertainty.factor,
             known: spread(errors),
-            renewed: errors.renewed().map(|(anew, probability)| (spread(&anew), probability)),
+            renewed: errors
+                .renewed()
+                .map(|(drawn_again, probability)| (spread(&drawn_again), probability)),
             added,
             weights: imm.predicted_probabilities(interval, models),
             widest: models.widest() * moved,
@@ -238,7 +241,7 @@ impl BearingPrediction {
         }
         // S without the process noise, which each model adds in its turn.
         let spread = by.steady + self.model.covariance_of(line) * self.factor;
-        let gate_distance = distance(&spread, self.widest, innovation)?.0;
+        let gate_distance = distance(&spread, self.widest, innovation)?.squared;
         if !gate.holds(gate_distance) {
             return None;
         }
@@ -246,7 +249,8 @@ impl BearingPrediction {
         let mut density = 0.0;
         for (&added, &weight) in self.added.iter().zip(&self.weights) {
             if weight > 0.0 {
-                let (squared, determinant) = distance(&spread, added, innovation)?;
+                let MahalanobisDistance { squared, determinant } =
+                    distance(&spread, added, innovation)?;
                 density += weight * (-squared / 2.0).exp() / (2.0 * PI * determinant.sqrt());
             }
         }
@@ -254,15 +258,27 @@ impl BearingPrediction {
     }
 }
 
+/// Mahalanobis distance of a vector.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct MahalanobisDistance {
+    /// Its square.
+    pub(crate) squared: f64,
+    /// Determinant of the covariance.
+    pub(crate) determinant: f64,
+}
+
 /// Logarithm of a two-dimensional normal density of mean 0.
 pub(crate) fn log_density(covariance: &Matrix2<f64>, vector: Vector2<f64>) -> Option<f64> {
-    let (squared, determinant) = distance(covariance, 0.0, vector)?;
+    let MahalanobisDistance { squared, determinant } = distance(covariance, 0.0, vector)?;
     Some(-squared / 2.0 - (2.0 * PI).ln() - determinant.ln() / 2.0)
 }
 
-/// Squared Mahalanobis distance of a vector for `covariance + I added`, and the determinant of
-/// that.
-fn distance(covariance: &Matrix2<f64>, added: f64, vector: Vector2<f64>) -> Option<(f64, f64)> {
+/// Distance of a vector for `covariance + I added`.
+fn distance(
+    covariance: &Matrix2<f64>,
+    added: f64,
+    vector: Vector2<f64>,
+) -> Option<MahalanobisDistance> {
     let [xx, xy, yy] = [covariance.m11 + added, covariance.m12, covariance.m22 + added];
     let determinant = xx * yy - xy * xy;
     let squared = (yy * vector.x * vector.x - 2.0 * xy * vector.x * vector.y
@@ -270,7 +286,8 @@ fn distance(covariance: &Matrix2<f64>, added: f64, vector: Vector2<f64>) -> Opti
         / determinant;
     // A negative definite matrix has a positive determinant too, so the first element is tested as
     // well.
-    (determinant > 0.0 && xx > 0.0 && squared.is_finite()).then_some((squared, determinant))
+    let is_possible = determinant > 0.0 && xx > 0.0 && squared.is_finite();
+    is_possible.then_some(MahalanobisDistance { squared, determinant })
 }
 
 #[cfg(test)]

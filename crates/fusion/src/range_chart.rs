@@ -50,6 +50,17 @@ pub(crate) struct ChartPoint {
     pub(crate) state_by: Matrix6<f64>,
 }
 
+/// An update of position and velocity.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct StateUpdate {
+    /// The covariance after it.
+    pub(crate) covariance: Matrix6<f64>,
+    /// I - K H, which the state's covariance with any other error is multiplied by.
+    pub(crate) carried: Matrix6<f64>,
+    /// The gain K.
+    pub(crate) gain: Matrix6x2<f64>,
+}
+
 impl StateChart {
     /// The Cartesian chart about a state, for a target that several cameras place.
     pub(crate) fn cartesian(state: &KinematicState) -> Self {
@@ -87,26 +98,26 @@ impl StateChart {
 
     /// Transforms the result of an update back from the chart at one of its points. The update
     /// measured the position with the Jacobian `by` (on the first three coordinates) and the gain
-    /// K. Returns the covariance, the factor I - K H that is applied to the state's covariance with
-    /// any other error, and K, all for position and velocity.
+    /// K.
     pub(crate) fn from(
         &self,
         point: &ChartPoint,
         covariance: Matrix6<f64>,
         by: &Matrix2x3<f64>,
         gain: Matrix6x2<f64>,
-    ) -> (Matrix6<f64>, Matrix6<f64>, Matrix6x2<f64>) {
+    ) -> StateUpdate {
         // I - K H, where H = [by, 0].
         let mut left = Matrix6::identity();
         let mut of_place = left.fixed_columns_mut::<3>(0);
         of_place -= gain * by;
         match self {
-            Self::Cartesian(_) => (covariance, left, gain),
+            Self::Cartesian(_) => StateUpdate { covariance, carried: left, gain },
             Self::ByRange(chart) => {
                 let state_by = point.state_by;
                 let covariance = state_by * covariance * state_by.transpose();
                 // From state to chart at the old point, from chart to state at the new one.
-                (covariance, state_by * left * chart.by_state(), state_by * gain)
+                let carried = state_by * left * chart.by_state();
+                StateUpdate { covariance, carried, gain: state_by * gain }
             }
         }
     }

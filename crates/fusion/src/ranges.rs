@@ -10,46 +10,53 @@ use crate::{
 };
 
 /// A number of the configuration, with the range in which it makes sense.
-struct Range {
+struct KeyRange {
     key: &'static str,
     value: f64,
     least: f64,
     most: f64,
 }
 
-const fn range(key: &'static str, value: f64, least: f64, most: f64) -> Range {
-    Range { key, value, least, most }
+const fn range(key: &'static str, value: f64, least: f64, most: f64) -> KeyRange {
+    KeyRange { key, value, least, most }
 }
 
 /// A key and its number.
 type NumberKey = (&'static str, fn(&FusionConfig) -> f64);
 
-// Keys that one method alone uses.
+/// Keys of equal weights for all bearings.
 const OF_EQUAL_WEIGHTS: &[NumberKey] = &[("bearings.equal_sd_rad", |c| c.bearings.equal_sd_rad)];
+/// Keys of the papers' pairs of lines.
 const OF_PAIRS: &[NumberKey] = &[("initiation.pair_gate_m2", |c| c.initiation.pair_gate_m2)];
+/// Keys of the papers' grouping of fixes.
 const OF_GROUPING: &[NumberKey] =
     &[("initiation.temporal_gate_m", |c| c.initiation.temporal_gate_m.unwrap_or(f64::NAN))];
+/// Keys of the initiation by hypotheses.
 const OF_HYPOTHESES: &[NumberKey] = &[
     ("initiation.birth_density_per_m3", |c| c.initiation.birth_density_per_m3),
     ("initiation.pair_s", |c| c.initiation.pair_s),
 ];
+/// Keys of a single motion model.
 const OF_ONE_MODEL: &[NumberKey] =
     &[("tracking.acceleration_density", |c| c.tracking.acceleration_density)];
+/// Keys of several motion models.
 const OF_MODELS: &[NumberKey] = &[
     ("tracking.switching_rate_per_s", |c| c.tracking.switching_rate_per_s),
     ("tracking.calming_rate_per_s", |c| c.tracking.calming_rate_per_s),
     ("tracking.restlessness_prior_s", |c| c.tracking.restlessness_prior_s),
 ];
+/// Keys of the manoeuvre detector by smoothed residuals.
 const OF_SMOOTHED_RESIDUAL: &[NumberKey] = &[
     ("tracking.residual_window", |c| c.tracking.residual_window as f64),
     ("tracking.residual_scale", |c| c.tracking.residual_scale),
 ];
+/// Keys of the manoeuvre detector by innovations.
 const OF_INNOVATION: &[NumberKey] = &[
     ("tracking.innovation_window", |c| c.tracking.innovation_window as f64),
     ("tracking.innovation_false_alarm", |c| c.tracking.innovation_false_alarm),
 ];
 
-impl Range {
+impl KeyRange {
     fn check(&self) -> Result<(), FusionConfigError> {
         let &Self { key, value, least, most } = self;
         // NaN is in no range.
@@ -80,7 +87,7 @@ impl FusionConfig {
     /// The first [`FusionConfigError`].
     pub fn validate(&self) -> Result<(), FusionConfigError> {
         let ranges = [self.time_and_bearings(), self.initiation_ranges(), self.tracking_ranges()];
-        ranges.iter().flatten().try_for_each(Range::check)?;
+        ranges.iter().flatten().try_for_each(KeyRange::check)?;
         self.models()?;
         self.probabilities()?;
         self.unused().map_or(Ok(()), Err)
@@ -115,7 +122,7 @@ impl FusionConfig {
         })
     }
 
-    fn time_and_bearings(&self) -> Vec<Range> {
+    fn time_and_bearings(&self) -> Vec<KeyRange> {
         let Self { event_time, bearings, clocks, .. } = self;
         vec![
             range("event_time.lateness_s", event_time.lateness_s, 1e-3, 60.0),
@@ -127,7 +134,7 @@ impl FusionConfig {
         ]
     }
 
-    fn initiation_ranges(&self) -> Vec<Range> {
+    fn initiation_ranges(&self) -> Vec<KeyRange> {
         let it = &self.initiation;
         vec![
             range("initiation.birth_density_per_m3", it.birth_density_per_m3, 1e-30, 1.0),
@@ -143,7 +150,7 @@ impl FusionConfig {
         ]
     }
 
-    fn tracking_ranges(&self) -> Vec<Range> {
+    fn tracking_ranges(&self) -> Vec<KeyRange> {
         let it = &self.tracking;
         vec![
             range("tracking.switching_rate_per_s", it.switching_rate_per_s, 1e-9, 100.0),
@@ -246,7 +253,7 @@ mod tests {
         for range in tables.iter().flatten() {
             assert_eq!(range.check(), Ok(()), "the default is in its range");
             for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -1.0, 1e150] {
-                let odd = Range { value, ..*range };
+                let odd = KeyRange { value, ..*range };
                 assert!(odd.check().is_err(), "{} may be {value}", odd.key);
             }
         }

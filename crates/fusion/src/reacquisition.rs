@@ -1,7 +1,7 @@
 //! Re-acquisition: a second camera sees the target of a track that one camera alone follows. Any of
 //! its bearings that crosses the sight line may be the target's, so each is followed as a
-//! hypothesis of its own (a leaf) until one is sure. All others, of other objects or of nothing, are
-//! clutter.
+//! hypothesis of its own (a leaf) until one is sure. All others, of other objects or of nothing,
+//! are clutter.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use crossfix_filter::Gate;
 
 use crate::cameras::KnownCamera;
 use crate::motion::MotionSetup;
-use crate::track::{Track, TrackId};
+use crate::track::{FusedTrack, TrackId};
 use crate::visibility::log_missed;
 use crate::{Exposure, Tracking};
 
@@ -29,7 +29,7 @@ const MAX_LEAVES: usize = 4;
 /// these being the target's against being clutter.
 #[derive(Clone, Debug)]
 struct Leaf {
-    track: Track,
+    track: FusedTrack,
     log_ratio: f64,
 }
 
@@ -54,7 +54,7 @@ pub(crate) struct ReacquisitionContext<'a> {
 impl ReacquisitionContext<'_> {
     /// The sightings (by index) in a track's gate, with their log-likelihood ratios against
     /// clutter, the best first.
-    fn fits(&self, track: &Track, owner: TrackId) -> Vec<(f64, usize)> {
+    fn fits(&self, track: &FusedTrack, owner: TrackId) -> Vec<(f64, usize)> {
         let Self { exposure, known, motion, config, .. } = self;
         let (camera, origin) = (&exposure.camera, known.camera.pose().position());
         let Some(expected) =
@@ -77,16 +77,16 @@ impl ReacquisitionContext<'_> {
     }
 
     /// Whether the camera should see the track's target.
-    fn expects(&self, track: &Track) -> bool {
+    fn expects(&self, track: &FusedTrack) -> bool {
         self.known.expects(track.position_at(self.exposure.time), self.max_range_m)
     }
 
     /// A copy of a track, updated with a sighting; `None` if the numbers fail.
-    fn taken(&self, track: &Track, index: usize) -> Option<Track> {
+    fn taken(&self, track: &FusedTrack, index: usize) -> Option<FusedTrack> {
         let Exposure { camera, time, sightings, .. } = self.exposure;
         let mut track = track.clone();
         track.measurement_update(self.exposure.bearing(&sightings[index].line), self.motion)?;
-        track.look(camera, *time, true, self.config.detection_probability, self.motion);
+        track.note_visibility(camera, *time, true, self.config.detection_probability, self.motion);
         Some(track)
     }
 
@@ -107,13 +107,13 @@ impl ReacquisitionContext<'_> {
             let detection = self.config.detection_probability;
             let visible = leaf.track.visible_to(camera, *time, self.motion);
             leaf.log_ratio += log_missed(visible, detection);
-            leaf.track.look(camera, *time, false, detection, self.motion);
+            leaf.track.note_visibility(camera, *time, false, detection, self.motion);
         }
         (leaf.log_ratio > GIVEN_UP).then_some((leaf, None))
     }
 
     /// New leaves, one for each of the exposure's best free sightings.
-    fn begun(&self, track: &Track) -> Vec<(Leaf, Option<usize>)> {
+    fn begun(&self, track: &FusedTrack) -> Vec<(Leaf, Option<usize>)> {
         if !track.is_lost_sight_of_by(&self.exposure.camera, self.motion) {
             return Vec::new();
         }
@@ -132,12 +132,13 @@ impl Reacquisition {
     /// are found again, with the sighting (by index) that has settled it.
     pub(crate) fn advance(
         &mut self,
-        tracks: &BTreeMap<TrackId, Track>,
+        tracks: &BTreeMap<TrackId, FusedTrack>,
         context: &ReacquisitionContext<'_>,
-    ) -> Vec<(Track, Option<usize>)> {
-        self.leaves.retain(|id, _| tracks.get(id).is_some_and(|track| !track.is_held()));
+    ) -> Vec<(FusedTrack, Option<usize>)> {
+        self.leaves.retain(|id, _| tracks.get(id).is_some_and(|track| !track.is_triangulated()));
         let mut found = Vec::new();
-        let alone = tracks.values().filter(|track| track.is_confirmed() && !track.is_held());
+        let alone =
+            tracks.values().filter(|track| track.is_confirmed() && !track.is_triangulated());
         for track in alone {
             let before = self.leaves.remove(&track.id).unwrap_or_default();
             let mut next: Vec<_> =

@@ -48,6 +48,7 @@ struct WaitingBounds {
     bearings: usize,
 }
 
+/// See there, also for what breaks with half of them.
 const BOUNDS: WaitingBounds = WaitingBounds { frames: 200, bearings: 20_000 };
 
 /// A frame as stamped by a clock that is `ahead_s` ahead of its camera's.
@@ -167,6 +168,18 @@ struct Pending {
     gone_s: BTreeMap<CameraName, f64>,
 }
 
+impl Pending {
+    fn beginning(rhythms: &BTreeMap<CameraName, Rhythm>) -> Self {
+        let gone_s = rhythms.iter().map(|(name, rhythm)| (name.clone(), rhythm.gone_s)).collect();
+        Self { gone_s, ..Self::default() }
+    }
+
+    /// How far a camera has gone on since the first of these steps, s.
+    fn waited_s(&self, camera: &CameraName, rhythm: &Rhythm) -> f64 {
+        rhythm.gone_s - self.gone_s.get(camera).copied().unwrap_or(0.0)
+    }
+}
+
 /// Decision on a frame.
 #[derive(Debug, PartialEq)]
 pub(crate) enum FrameDecision {
@@ -231,12 +244,7 @@ impl SiteTime {
         rhythm.heard_s = self.gone_s;
         // A clock that was not on the site's time steps for itself.
         if let Some(step_s) = step.filter(|_| self.is_of_site(camera, before.settled())) {
-            let gone_s = || {
-                self.rhythms.iter().map(|(name, rhythm)| (name.clone(), rhythm.gone_s)).collect()
-            };
-            let pending = self
-                .pending
-                .get_or_insert_with(|| Pending { gone_s: gone_s(), ..Pending::default() });
+            let pending = self.pending.get_or_insert_with(|| Pending::beginning(&self.rhythms));
             pending.steps.entry(camera.clone()).or_insert(ClockStep { step_s, before, others_s });
         }
         let Some(pending) = &mut self.pending else {
@@ -267,7 +275,7 @@ impl SiteTime {
 
     /// Handles a camera that does not keep the site's time with its clock's steps taken off: they
     /// were none.
-    pub(crate) fn doubt(&mut self, camera: &CameraName) {
+    pub(crate) fn forget_steps(&mut self, camera: &CameraName) {
         if let Some(rhythm) = self.rhythms.get_mut(camera) {
             rhythm.ahead_s = 0.0;
         }
@@ -339,19 +347,17 @@ impl SiteTime {
         let mut steps: Vec<f64> = pending.steps.values().map(|step| step.step_s).collect();
         steps.sort_unstable_by(f64::total_cmp);
         let step = steps[steps.len() / 2];
-        let is_alike = steps.iter().all(|other| (other - step).abs() < LEAST_STEP_S);
-        if is_alike
+        let is_common = steps.iter().all(|other| (other - step).abs() < LEAST_STEP_S);
+        if is_common
             && steps.len() >= 2
             && self.live().all(|(name, _)| pending.steps.contains_key(name))
         {
             return Some(Some(step));
         }
-        let gone_s = |(name, rhythm): (&CameraName, &Rhythm)| {
-            rhythm.gone_s - pending.gone_s.get(name).copied().unwrap_or(0.0)
-        };
         let bearings: usize = pending.frames.iter().map(|frame| frame.tracks.len()).sum();
         let is_full = pending.frames.len() >= BOUNDS.frames || bearings > BOUNDS.bearings;
-        let is_late = self.live().map(gone_s).fold(0.0, f64::max) > self.longest_s;
+        let waited_s = self.live().map(|(name, rhythm)| pending.waited_s(name, rhythm));
+        let is_late = waited_s.fold(0.0, f64::max) > self.longest_s;
         (is_full || is_late || self.live().count() < 2).then_some(None)
     }
 }

@@ -31,7 +31,7 @@ use crate::motion::{
 };
 use crate::spatial::{Fix, Observability, TimedLine};
 use crate::uncertainty::CameraUncertainty;
-use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
+use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, bearing_update};
 use crate::visibility::Visibility;
 
 pub(crate) use expectation::TrackExpectation;
@@ -103,13 +103,13 @@ pub(crate) struct TrackBearing<'a> {
 
 /// A 3D track of one target, updated by single bearings of single cameras.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Track {
+pub struct FusedTrack {
     /// Its number.
     pub id: TrackId,
     /// Its stage of life.
     pub status: TrackStatus,
     /// Capture time of the newest bearing used: the time of [`Self::state`].
-    pub updated: Timestamp,
+    pub updated_at: Timestamp,
     /// Log-likelihood ratio of target against clutter.
     pub score: f64,
     /// Residual of each camera's newest bearing.
@@ -121,10 +121,10 @@ pub struct Track {
     pub observability: Observability,
     /// When [`Self::observability`] was computed last.
     observed: Timestamp,
-    /// Whether two cameras have seen it lately: see [`Self::is_held`].
-    held: bool,
-    /// Whether two cameras see it now, so that its range is observed and its motion along every axis:
-    /// this decides about coordinates. A track that is held is not always ranged.
+    /// Whether two cameras have seen it lately: see [`Self::is_triangulated`].
+    triangulated: bool,
+    /// Whether two cameras see it now, so that its range is observed and its motion along every
+    /// axis: this decides about coordinates. A triangulated track is not always ranged.
     ranged: bool,
     /// When the track began.
     pub(crate) born: Timestamp,
@@ -159,7 +159,7 @@ pub(crate) struct StartLine<'a> {
     pub(crate) uncertainty: CameraUncertainty,
 }
 
-impl Track {
+impl FusedTrack {
     /// A tentative track at a fix of these lines.
     pub(crate) fn start<'a>(
         fix: &Fix,
@@ -169,13 +169,13 @@ impl Track {
         let mut track = Self {
             id: TrackId(0),
             status: TrackStatus::Tentative,
-            updated: fix.time,
+            updated_at: fix.time,
             score: 0.0,
             residuals: BTreeMap::new(),
             solver: fix.solver,
             observability: fix.observability,
             observed: fix.time,
-            held: true,
+            triangulated: true,
             ranged: true,
             born: fix.time,
             has_ends: false,
@@ -210,7 +210,7 @@ impl Track {
         let mut track = Self::start(fix, [StartLine { camera, line, uncertainty }], motion);
         // One camera alone: nothing holds the range, and what moves along the sight line is not
         // seen.
-        (track.held, track.ranged, track.follower) = (false, false, Some(line.line.origin));
+        (track.triangulated, track.ranged, track.follower) = (false, false, Some(line.line.origin));
         // A wrong pose does not change how fast the direction turns: the velocity is not tied to
         // it.
         track.ties.values_mut().for_each(Ties::forget_velocity);
@@ -253,7 +253,7 @@ impl Track {
         Some(())
     }
 
-    /// Position and velocity at [`Self::updated`].
+    /// Position and velocity at [`Self::updated_at`].
     pub fn state(&self) -> &KinematicState {
         self.imm.combined()
     }
@@ -283,13 +283,13 @@ impl Track {
 
     /// Position and velocity expected at another time.
     pub(crate) fn predicted(&self, time: Timestamp, motion: &MotionSetup) -> KinematicState {
-        self.imm.predicted(time.seconds_since(self.updated), motion.models(self.ranged))
+        self.imm.predicted(time.seconds_since(self.updated_at), motion.models(self.ranged))
     }
 
     /// Where the target is expected at another time: the mean alone.
     pub(crate) fn position_at(&self, time: Timestamp) -> Point3<f64> {
         let state = self.imm.combined();
-        state.position() + state.velocity() * time.seconds_since(self.updated)
+        state.position() + state.velocity() * time.seconds_since(self.updated_at)
     }
 
     /// The track's state now and for the seconds ahead, for cueing.
@@ -306,7 +306,7 @@ impl Track {
 
     /// How many other cameras than this one have lately seen the target.
     pub(crate) fn others_than(&self, camera: &CameraName, motion: &MotionSetup) -> usize {
-        let lately = |ties: &Ties| ties.has_seen_lately(self.updated, motion.holding_s);
+        let lately = |ties: &Ties| ties.has_seen_lately(self.updated_at, motion.holding_s);
         self.ties.iter().filter(|(name, ties)| lately(ties) && *name != camera).count()
     }
 
@@ -314,13 +314,13 @@ impl Track {
     fn is_followed_by(&self, camera: &CameraName, motion: &MotionSetup) -> bool {
         self.ties
             .get(camera)
-            .is_some_and(|ties| ties.has_seen_lately(self.updated, motion.holding_s))
+            .is_some_and(|ties| ties.has_seen_lately(self.updated_at, motion.holding_s))
     }
 
     /// Whether the track is too uncertain to be associated directly with a camera that has not been
     /// following it: any line that crosses the other camera's sight line would pass for its target.
     pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName, motion: &MotionSetup) -> bool {
-        !self.held
+        !self.triangulated
             && !self.is_followed_by(camera, motion)
             && self.position_sd() > MAX_PAIR_SHARE * self.range()
     }
@@ -352,12 +352,12 @@ impl Track {
 
     /// Whether another camera has seen the target since this one last looked for it. If nobody has,
     /// whatever hides the target hides it from all cameras, and further misses are no new evidence.
-    pub(crate) fn is_seen_since_look_of(&self, camera: &CameraName) -> bool {
-        self.ties.get(camera).is_none_or(|ties| self.updated > ties.visibility.last_look())
+    pub(crate) fn is_seen_since_exposure_of(&self, camera: &CameraName) -> bool {
+        self.ties.get(camera).is_none_or(|ties| self.updated_at > ties.visibility.last_exposure())
     }
 
     /// Notes whether a camera that should see the target has reported it.
-    pub(crate) fn look(
+    pub(crate) fn note_visibility(
         &mut self,
         camera: &CameraName,
         time: Timestamp,
@@ -367,13 +367,13 @@ impl Track {
     ) {
         self.note(camera, time);
         if let Some(ties) = self.ties.get_mut(camera) {
-            ties.visibility.look(time, seen, detection, motion.holding_s);
+            ties.visibility.update(time, seen, detection, motion.holding_s);
         }
     }
 
     /// Adds evidence (a log-likelihood ratio) for or against the track to its score, which is
     /// capped at `most`.
-    pub(crate) fn judge(&mut self, change: f64, most: f64) {
+    pub(crate) fn add_evidence(&mut self, change: f64, most: f64) {
         self.score = (self.score + change).min(most);
     }
 
@@ -386,7 +386,7 @@ impl Track {
         motion: &MotionSetup,
     ) -> Option<Taken> {
         let TrackBearing { camera, time, line, uncertainty } = bearing;
-        let interval = time.seconds_since(self.updated);
+        let interval = time.seconds_since(self.updated_at);
         let innovation = self.innovation(time, line)?;
         let manoeuvre = self.sees_manoeuvre(&innovation, &bearing, motion);
         if manoeuvre {
@@ -400,34 +400,34 @@ impl Track {
         let known = self.errors_of(camera, interval);
         // A lasting error may have been drawn again since (a label that jumps): take the likelier
         // case.
-        let anew = self.renewed(&innovation, &bearing, &known, motion);
-        let errors = anew.unwrap_or(known);
+        let renewed = self.renewed(&innovation, &bearing, &known, motion);
+        let errors = renewed.unwrap_or(known);
         let measured = Measured { line, camera: uncertainty, errors: &errors };
         let mut results: Vec<Option<Updated>> = Vec::with_capacity(crossfix_filter::MAX_MODELS);
         self.imm.update(interval, motion.models(self.ranged), |state| {
-            let result = updated(state, seen_from, &measured);
+            let result = bearing_update(state, seen_from, &measured);
             let likely = result.as_ref().map(|after| (after.state.clone(), after.log_likelihood));
             results.push(result);
             likely
         })?;
-        if anew.is_some() {
+        if renewed.is_some() {
             self.renew(camera);
         }
         // The errors outside the state are carried once, with the mean of all models' updates.
         let nis = self.carry(&bearing, &results);
         self.gather_information(&bearing);
-        self.updated = time;
+        self.updated_at = time;
         self.follower = Some(line.origin);
         self.solver = Solver::Kalman;
         self.ties.get_mut(camera).into_iter().for_each(|ties| ties.see(time));
-        let residual = MeasurementResidual { time, angle: innovation.offset.norm(), nis };
+        let residual = MeasurementResidual { time, angle: innovation.residual.norm(), nis };
         if let Some(newest) = self.residuals.get_mut(camera) {
             *newest = residual;
         } else {
             self.residuals.insert(camera.clone(), residual);
         }
         let lately = |ties: &&Ties| ties.has_seen_lately(time, motion.holding_s);
-        self.held = self.ties.values().filter(lately).count() >= 2;
+        self.triangulated = self.ties.values().filter(lately).count() >= 2;
         self.range_again(line, motion);
         self.gather(&bearing, &innovation);
         let third_differences = self.third_differences(camera, line, motion);
@@ -438,12 +438,12 @@ impl Track {
     /// seeing it for some time already, and the target may have moved along that camera's sight
     /// line unseen: this motion is added for the time since.
     fn range_again(&mut self, line: &SightLine, motion: &MotionSetup) {
-        let sees = |ties: &&Ties| ties.sees(self.updated, motion.holding_s);
+        let sees = |ties: &&Ties| ties.sees(self.updated_at, motion.holding_s);
         // Only the step from two cameras to one adds motion; later bearings find `ranged` false
         // already.
         let is_ranged = self.ties.values().filter(sees).count() >= 2;
         if std::mem::replace(&mut self.ranged, is_ranged) && !is_ranged {
-            let silent = self.ties.values().filter_map(|ties| ties.silent_s(self.updated));
+            let silent = self.ties.values().filter_map(|ties| ties.silent_s(self.updated_at));
             // The camera of this bearing is silent for 0 s; the shortest silence of the others is
             // the time to make up for.
             let silent_s = silent.filter(|silent_s| *silent_s > 0.0).fold(f64::INFINITY, f64::min);
@@ -457,14 +457,14 @@ impl Track {
     /// Whether two cameras have lately supported the track, within 1.5 s or so. With only one since
     /// then the range has been unobserved for long, and the track may have drifted along its sight
     /// line.
-    pub fn is_held(&self) -> bool {
-        self.held
+    pub fn is_triangulated(&self) -> bool {
+        self.triangulated
     }
 
     /// Moves all times of the track: all clocks have stepped by `step_s` seconds.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         let residuals = self.residuals.values_mut().map(|residual| &mut residual.time);
-        let own = [&mut self.updated, &mut self.observed, &mut self.born, &mut self.drawn];
+        let own = [&mut self.updated_at, &mut self.observed, &mut self.born, &mut self.drawn];
         for time in own.into_iter().chain(residuals) {
             *time = time.plus_seconds(step_s);
         }
@@ -474,7 +474,7 @@ impl Track {
 
     /// Time from its beginning to its latest bearing, s.
     pub(crate) fn age_s(&self) -> f64 {
-        self.updated.seconds_since(self.born)
+        self.updated_at.seconds_since(self.born)
     }
 
     /// Whether it has been confirmed and is not lost.

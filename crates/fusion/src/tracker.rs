@@ -13,7 +13,7 @@ use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, ScaleSample, T
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::reacquisition::{Reacquisition, ReacquisitionContext};
-use crate::track::{Track, TrackExpectation, TrackId, TrackStatus};
+use crate::track::{FusedTrack, TrackExpectation, TrackId, TrackStatus};
 
 use association::fitting;
 
@@ -49,7 +49,7 @@ pub(crate) struct Tracker {
     gate: Gate,
     /// Beyond this range no camera is expected to see a target, m.
     max_range_m: f64,
-    tracks: BTreeMap<TrackId, Track>,
+    tracks: BTreeMap<TrackId, FusedTrack>,
     /// Time of the first exposure of the run.
     began: Option<Timestamp>,
     /// Number of the next track in this run.
@@ -68,8 +68,8 @@ struct Noted {
 /// A sighting that a track has used.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct UsedSighting {
-    /// Its index: among the exposure's sightings where tracks have used it, among the free ones where
-    /// they claim it.
+    /// Its index: among the exposure's sightings where tracks have used it, among the free ones
+    /// where weakly supported ones have used it.
     pub(crate) index: usize,
     pub(crate) track: TrackId,
 }
@@ -80,7 +80,7 @@ pub(crate) struct TrackerStep {
     /// The sightings that belong to no track, or to a track that only one camera supports.
     pub(crate) free: Vec<Sighting>,
     /// Those of them that such a weakly supported track has used, by their indices among the free.
-    pub(crate) claims: Vec<UsedSighting>,
+    pub(crate) provisional: Vec<UsedSighting>,
     /// Which sighting updated which track.
     pub(crate) used: Vec<UsedSighting>,
     /// How the exposure fits the confirmed targets that other cameras see.
@@ -114,7 +114,7 @@ impl Tracker {
     }
 
     /// All tracks, ordered by id; those lost in this step are included one last time, as lost.
-    pub(crate) fn tracks(&self) -> impl Iterator<Item = &Track> {
+    pub(crate) fn tracks(&self) -> impl Iterator<Item = &FusedTrack> {
         self.tracks.values()
     }
 
@@ -126,7 +126,7 @@ impl Tracker {
             let silent = track.published.is_none_or(|(time, status)| {
                 status != track.status || now.seconds_since(time) >= PUBLISHED_EVERY_S
             });
-            if silent || track.updated == now {
+            if silent || track.updated_at == now {
                 track.published = Some((now, track.status));
                 track.observe_again();
                 due.push(track.id);
@@ -157,11 +157,11 @@ impl Tracker {
 
     /// Whether any track is confirmed.
     pub(crate) fn has_sure(&self) -> bool {
-        self.tracks.values().any(Track::is_confirmed)
+        self.tracks.values().any(FusedTrack::is_confirmed)
     }
 
     /// A track by its number.
-    pub(crate) fn track(&self, id: TrackId) -> Option<&Track> {
+    pub(crate) fn track(&self, id: TrackId) -> Option<&FusedTrack> {
         self.tracks.get(&id)
     }
 
@@ -191,7 +191,7 @@ impl Tracker {
     /// The index of the bearing of an exposure that fits a track best.
     fn nearest_sighting(
         &self,
-        track: &Track,
+        track: &FusedTrack,
         exposure: &Exposure,
         known: &KnownCamera,
     ) -> Option<usize> {
@@ -205,7 +205,7 @@ impl Tracker {
     /// The predicted bearing of a track in an exposure.
     fn expectation(
         &self,
-        track: &Track,
+        track: &FusedTrack,
         exposure: &Exposure,
         known: &KnownCamera,
     ) -> Option<TrackExpectation> {
@@ -219,11 +219,11 @@ impl Tracker {
     }
 
     /// Goes back to a time: ends the tracks that bearings of later times have updated.
-    pub(crate) fn restart(&mut self, time: Timestamp) -> Vec<TrackChange> {
+    pub(crate) fn rewind(&mut self, time: Timestamp) -> Vec<TrackChange> {
         let mut changes = Vec::new();
         for track in self.tracks.values_mut() {
             track.published = None;
-            if track.updated > time && track.status != TrackStatus::Lost {
+            if track.updated_at > time && track.status != TrackStatus::Lost {
                 track.status = TrackStatus::Lost;
                 changes.push(TrackChange::new(TrackEventKind::Lost, track.id));
             }
@@ -246,7 +246,12 @@ impl Tracker {
 
     /// The best log-likelihood ratio of a bearing being this track's; `None` without one in its
     /// gate.
-    fn best_ratio(&self, track: &Track, exposure: &Exposure, known: &KnownCamera) -> Option<f64> {
+    fn best_ratio(
+        &self,
+        track: &FusedTrack,
+        exposure: &Exposure,
+        known: &KnownCamera,
+    ) -> Option<f64> {
         let expected = self.expectation(track, exposure, known)?;
         let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
         // ln(N / clutter), P_D left out: it is the same for both times that are compared.
@@ -276,26 +281,30 @@ impl Tracker {
             .filter_map(|(index, owner)| Some(UsedSighting { index, track: (*owner)? }))
             .collect();
         let unassigned = owners.iter().filter(|owner| owner.is_none()).count();
-        let (mut free, mut claims) = (Vec::new(), Vec::new());
+        let (mut free, mut provisional) = (Vec::new(), Vec::new());
         for (sighting, owner) in exposure.sightings.iter().zip(owners) {
             // Bearings of tracks that one camera alone follows are offered to the initiation as
             // free: if the other cameras see the target elsewhere, it must be found again.
-            let weak = owner.filter(|id| self.tracks.get(id).is_some_and(|track| !track.is_held()));
+            let weak = owner
+                .filter(|id| self.tracks.get(id).is_some_and(|track| !track.is_triangulated()));
             if owner.is_none() || weak.is_some() {
-                claims.extend(weak.map(|track| UsedSighting { index: free.len(), track }));
+                provisional.extend(weak.map(|track| UsedSighting { index: free.len(), track }));
                 free.push(sighting.clone());
             }
         }
         changes.extend(self.review(exposure.time));
         changes.extend(self.merge(exposure.time));
         changes.extend(self.prove(exposure.time, cameras));
-        TrackerStep { free, claims, used, fittings, third_differences, unassigned, changes }
+        TrackerStep { free, provisional, used, fittings, third_differences, unassigned, changes }
     }
 
     /// The cameras' mean offsets from confirmed targets, by target, for those whose comparison is
     /// due; each with the age of its track, s.
     pub(crate) fn draws(&mut self) -> Vec<(f64, Vec<ScaleSample>)> {
-        let sure = self.tracks.values_mut().filter(|track| track.is_confirmed() && track.is_held());
+        let sure = self
+            .tracks
+            .values_mut()
+            .filter(|track| track.is_confirmed() && track.is_triangulated());
         let drawn = sure.map(|track| (track.age_s(), track.draw()));
         drawn.filter(|(_, samples)| samples.len() >= 2).collect()
     }
@@ -306,12 +315,12 @@ impl Tracker {
         self.tracks.values_mut().for_each(|track| track.rescale_pose(camera, ratio));
     }
 
-    /// Passes on that a camera's mount has turned it: see [`Track::turn_camera`].
+    /// Passes on that a camera's mount has turned it: see [`FusedTrack::turn_camera`].
     pub(crate) fn turn_camera(&mut self, camera: &CameraName) {
         self.tracks.values_mut().for_each(|track| track.turn_camera(camera));
     }
 
-    /// Passes on what has been learnt of a camera's clock: see [`Track::set_clock`].
+    /// Passes on what has been learnt of a camera's clock: see [`FusedTrack::set_clock`].
     pub(crate) fn set_clock(&mut self, camera: &CameraName, change: ClockChange) {
         self.tracks.values_mut().for_each(|track| track.set_clock(camera, change));
     }

@@ -5,7 +5,7 @@ use crossfix_message::ClockSource;
 use nalgebra::{Matrix2, Matrix6, Rotation3, SMatrix, SVector, Unit, Vector2, Vector3};
 
 /// Variances whose relative difference is less than this are equal: what rotating them leaves is
-/// far less.
+/// far less. With half of it the same.
 const ROUNDING: f64 = 1e-9;
 
 /// Number of errors that bearings of a camera share: two of its pose, one of its clock, and two
@@ -114,21 +114,21 @@ pub(crate) struct PoseUncertainty {
     /// Variances of rotation and position where all axes are alike and nothing is correlated, as
     /// most poses are declared: then all bearings are shifted alike, and no matrices need be
     /// multiplied.
-    alike: Option<[f64; 2]>,
+    isotropic: Option<[f64; 2]>,
 }
 
 impl PoseUncertainty {
     pub(crate) fn new(covariance: Matrix6<f64>) -> Self {
         let [rotation, position] = [covariance.m11, covariance.m44];
-        let alike = Self::diagonal(rotation, position);
+        let isotropic = Self::diagonal(rotation, position);
         // A covariance that was rotated into the world's axes has rounding off its diagonal.
         let [turns, moves] = [(0, rotation), (3, position)].map(|(from, variance)| {
-            let off = (covariance - alike).fixed_view::<3, 3>(from, from).amax();
+            let off = (covariance - isotropic).fixed_view::<3, 3>(from, from).amax();
             off <= ROUNDING * variance.abs()
         });
         let tied = covariance.fixed_view::<3, 3>(0, 3).amax() > 0.0;
-        let is_alike = turns && moves && !tied && rotation >= 0.0 && position >= 0.0;
-        Self { covariance, alike: is_alike.then_some([rotation, position]) }
+        let is_isotropic = turns && moves && !tied && rotation >= 0.0 && position >= 0.0;
+        Self { covariance, isotropic: is_isotropic.then_some([rotation, position]) }
     }
 
     fn diagonal(rotation: f64, position: f64) -> Matrix6<f64> {
@@ -141,10 +141,12 @@ impl PoseUncertainty {
 }
 
 /// Covariance of a pose whose uncertainty nobody has stated, rotation (rad) before position (m):
-/// what a careful survey reaches, 1 mrad and 5 cm per axis. With half of it a camera would be
-/// believed before the others are.
+/// what a careful survey reaches.
 pub fn pose_covariance_of_careful_survey() -> Matrix6<f64> {
+    /// Standard deviation of the rotation, rad per axis. With half of it a camera would be believed
+    /// before the others are.
     const ROTATION_SD_RAD: f64 = 1e-3;
+    /// The same of the position, m per axis.
     const POSITION_SD_M: f64 = 0.05;
     PoseUncertainty::diagonal(ROTATION_SD_RAD.powi(2), POSITION_SD_M.powi(2))
 }
@@ -232,13 +234,13 @@ impl CameraUncertainty {
     pub(crate) fn declared_pose(&self, model: &BearingModel) -> Matrix2<f64> {
         match self.pose {
             None => Matrix2::zeros(),
-            Some(PoseUncertainty { alike: Some([rotation, position]), .. }) => {
+            Some(PoseUncertainty { isotropic: Some([rotation, position]), .. }) => {
                 // All axes alike: the variance is that of the rotation plus that of the position
                 // over r^2.
                 let shift = (rotation + position / model.range.powi(2)).sqrt();
                 self.turn(model) * shift
             }
-            Some(PoseUncertainty { covariance, alike: None }) => {
+            Some(PoseUncertainty { covariance, isotropic: None }) => {
                 let by = model.by_pose();
                 let turn = self.turn(model);
                 // A root of J P J', taken in tangents of the camera's own axes.

@@ -49,6 +49,7 @@ struct ComparedBounds {
     image_tracks: usize,
 }
 
+/// See there, also for what breaks with half of each.
 const BOUNDS: ComparedBounds = ComparedBounds { lines: 30, image_tracks: 1_000 };
 
 /// Why no target is found.
@@ -108,7 +109,8 @@ impl fmt::Display for WhyNothing {
                 let km = max_range_m / 1000.0;
                 write!(
                     f,
-                    "but their lines meet nowhere within {km} km of both: check poses and `max_range_m`"
+                    "but their lines meet nowhere within {km} km of both: check poses and \
+                     `max_range_m`"
                 )
             }
             UnmetLines::Unsteady => {
@@ -175,13 +177,20 @@ impl PairResult {
     }
 }
 
+/// The time for which an image track has been there.
+#[derive(Clone, Copy, Debug)]
+struct FollowedTime {
+    first: Timestamp,
+    last: Timestamp,
+}
+
 /// What one camera has seen lately.
 #[derive(Clone, Debug)]
 struct LatelySeen {
     time: Timestamp,
     lines: Vec<TimedLine>,
-    /// Since when and until when each of its image tracks has been there.
-    since: BTreeMap<u64, (Timestamp, Timestamp)>,
+    /// By its image tracks.
+    followed: BTreeMap<u64, FollowedTime>,
 }
 
 /// Two cameras' last comparisons.
@@ -297,20 +306,21 @@ impl Unmet {
     /// lines.
     fn note(&mut self, exposure: &Exposure) -> Vec<TimedLine> {
         let now = exposure.time;
-        let nothing = || LatelySeen { time: now, lines: Vec::new(), since: BTreeMap::new() };
+        let nothing = || LatelySeen { time: now, lines: Vec::new(), followed: BTreeMap::new() };
         let seen = self.seen.entry(exposure.camera.clone()).or_insert_with(nothing);
-        seen.since.retain(|_, (_, last)| now.seconds_since(*last) <= SOMETHING_S);
+        seen.followed.retain(|_, followed| now.seconds_since(followed.last) <= SOMETHING_S);
         let mut lines = Vec::new();
         for (Sighting { image_track, rooted, .. }, (_, timed)) in
             exposure.sightings.iter().zip(lines_with_pose(exposure))
         {
-            let full = seen.since.len() >= BOUNDS.image_tracks;
-            if *rooted == Rooted::Yes || (full && !seen.since.contains_key(image_track)) {
+            let full = seen.followed.len() >= BOUNDS.image_tracks;
+            if *rooted == Rooted::Yes || (full && !seen.followed.contains_key(image_track)) {
                 continue;
             }
-            let (first, last) = seen.since.entry(*image_track).or_insert((now, now));
-            *last = now;
-            if now.seconds_since(*first) >= SOMETHING_S && lines.len() < BOUNDS.lines {
+            let begun = FollowedTime { first: now, last: now };
+            let followed = seen.followed.entry(*image_track).or_insert(begun);
+            followed.last = now;
+            if now.seconds_since(followed.first) >= SOMETHING_S && lines.len() < BOUNDS.lines {
                 lines.push(timed);
             }
         }
@@ -323,9 +333,8 @@ impl Unmet {
     fn conclusion(&self) -> Option<WhyNothing> {
         let steady: Vec<(&[CameraName; 2], &PairComparisons)> =
             self.pairs.iter().filter(|(_, pair)| pair.is_steady()).collect();
-        let total = |finding: &PairFinding| {
-            steady.iter().map(|(_, pair)| pair.count(*finding)).sum::<usize>()
-        };
+        let counts = |finding| steady.iter().map(move |(_, pair)| pair.count(finding));
+        let total = |finding: &PairFinding| -> usize { counts(*finding).sum() };
         // The commonest finding of all steady pairs, and of these pairs the one that shows it most
         // often.
         let most =

@@ -1,6 +1,6 @@
 //! The measurement update of one state by one bearing: an iterated extended Kalman update in the
 //! coordinates of [`StateChart`]. The camera's shared errors are considered (Schmidt) and not part
-//! of the state; what the bearing tells of them is returned separately ([`Told`]).
+//! of the state; what the bearing tells of them is returned separately ([`CrossUpdate`]).
 //!
 //! Notation: P is the state's covariance, H the bearing's Jacobian by the state, s the camera's
 //! shared errors (each in units of its own standard deviation), J their effect on the bearing
@@ -13,7 +13,7 @@ use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, SightLine};
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix6, Matrix6x2, Point3, Vector2, Vector6};
 
-use crate::range_chart::{ChartPoint, StateChart};
+use crate::range_chart::{ChartPoint, StateChart, StateUpdate};
 use crate::uncertainty::{CameraUncertainty, SharedErrors, SharedTies, Shifts};
 
 /// Most rounds of the iterated update: with a range known to a factor of three it takes four or
@@ -46,13 +46,13 @@ pub(crate) struct Updated {
     pub(crate) nis: f64,
     /// Logarithm of the bearing's likelihood, 1/sr.
     pub(crate) log_likelihood: f64,
-    pub(crate) told: Told,
+    pub(crate) told: CrossUpdate,
 }
 
 /// What a bearing tells of errors outside the state that are correlated with it; for one motion
 /// model, or as the mean over the models.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Told {
+pub(crate) struct CrossUpdate {
     /// carried = I - K H. The update turns Y, the cross-covariance of the state with any outside
     /// error, into `carried * Y`, ...
     pub(crate) carried: Matrix6<f64>,
@@ -82,7 +82,7 @@ pub(crate) struct ModelUpdate<'a> {
     pub(crate) probability: f64,
 }
 
-impl Told {
+impl CrossUpdate {
     /// The mean over motion models, and the spread over them.
     pub(crate) fn over<'a>(models: impl Iterator<Item = ModelUpdate<'a>> + Clone) -> Self {
         let mut mean = Self {
@@ -171,7 +171,7 @@ impl Linearised {
 
     /// The update that has come to these coordinates by this gain, with the prior covariance in the
     /// chart's coordinates. `None` if the numbers fail.
-    fn updated(
+    fn completed_at(
         &self,
         chart: &StateChart,
         coordinates: &Vector6<f64>,
@@ -183,7 +183,7 @@ impl Linearised {
         let nis = innovation.dot(&(inverse * innovation)).max(0.0);
         let point = chart.point(coordinates);
         // P <- P - K S K', and back to position and velocity.
-        let (covariance, carried, gain) =
+        let StateUpdate { covariance, carried, gain } =
             chart.from(&point, covariance - gain * across.transpose(), &by, gain);
         let state = KinematicState {
             mean: point.mean(),
@@ -197,7 +197,7 @@ impl Linearised {
             nis,
             // ln N(z; 0, S) in two dimensions: -(z' S^-1 z + ln((2 pi)^2 |S|)) / 2.
             log_likelihood: -(nis + (4.0 * PI.powi(2) * determinant).ln()) / 2.0,
-            told: Told {
+            told: CrossUpdate {
                 carried,
                 gained: gain * shifts,
                 by: by * chart.place_by_state(),
@@ -213,7 +213,7 @@ impl Linearised {
 
 /// The state updated by a bearing of the same time. `seen_from` is the position of the camera that
 /// alone follows the target, so that the range from there is uncertain. `None` if the numbers fail.
-pub(crate) fn updated(
+pub(crate) fn bearing_update(
     prior: &KinematicState,
     seen_from: Option<Point3<f64>>,
     measured: &Measured<'_>,
@@ -244,7 +244,7 @@ pub(crate) fn updated(
         if !(is_own || settled || round == MAX_ROUNDS) {
             continue;
         }
-        return seen.updated(&chart, &coordinates, &covariance, gain);
+        return seen.completed_at(&chart, &coordinates, &covariance, gain);
     }
     None
 }

@@ -48,7 +48,7 @@ impl Visibility {
     }
 
     /// Time of the camera's last exposure.
-    pub(crate) fn last_look(&self) -> Timestamp {
+    pub(crate) fn last_exposure(&self) -> Timestamp {
         self.time
     }
 
@@ -68,7 +68,7 @@ impl Visibility {
 
     /// Takes in an exposure that has shown the target or not; `detection` is the probability that
     /// the camera reports a target that is visible.
-    pub(crate) fn look(&mut self, time: Timestamp, seen: bool, detection: f64, holding_s: f64) {
+    pub(crate) fn update(&mut self, time: Timestamp, seen: bool, detection: f64, holding_s: f64) {
         let before = self.at(time, holding_s);
         // Bayes: P(visible | missed) = v (1 - d) / (v (1 - d) + 1 - v).
         let missed = before * (1.0 - detection);

@@ -41,7 +41,7 @@ impl Shown {
         let clocks = fusion.cameras().filter_map(|camera| camera.clock);
         self.clocks_s.extend(clocks.map(|clock| clock.offset_s));
         for track in fusion.tracks().filter(|track| track.is_confirmed()) {
-            let off = (track.state().position() - flight(track.updated.seconds())).norm();
+            let off = (track.state().position() - flight(track.updated_at.seconds())).norm();
             let stated = track.state().position_covariance().trace().sqrt();
             self.off.push(off);
             self.beyond += usize::from(off > 4.0 * stated);

@@ -19,8 +19,8 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-/// What a calibration by minutes of flight says of its cameras: turns (rad) and places (m) per axis, and
-/// how far the two are tied, as a place that is off is looked at from another side.
+/// What a calibration by minutes of flight says of its cameras: turns (rad) and places (m) per
+/// axis, and how far the two are tied, as a place that is off is looked at from another side.
 const TURN_SD: f64 = 3e-4;
 const SHIFT_SD: f64 = 0.02;
 const TIED: f64 = 0.7;
@@ -150,11 +150,13 @@ fn of_site(path: Path, seed: u64) -> [f64; 2] {
     [0, 1].map(|k| squares.iter().map(|square| square[k]).sum::<f64>() / squares.len() as f64)
 }
 
-/// How many sites are drawn. Their means differ by 2, so the mean of all has a standard error of 0.3.
+/// How many sites are drawn. Their means differ by 2, so the mean of all has a standard error of
+/// 0.3.
 const SITES: u64 = 40;
 
-/// Places are as well known as is said; velocities are said to be a little less well known than they are, as
-/// any target may turn: so it is with exact calibrations and clocks, too (2.9 and 4.0 of 6).
+/// Places are as well known as is said; velocities are said to be a little less well known than
+/// they are, as any target may turn: so it is with exact calibrations and clocks, too (2.9 and 4.0
+/// of 6).
 fn assert_honest(path: impl Fn() -> Path) {
     let means: Vec<[f64; 2]> = (0..SITES).map(|seed| of_site(path(), seed)).collect();
     let [place, all] = [0, 1].map(|k| means.iter().map(|mean| mean[k]).sum::<f64>() / SITES as f64);

@@ -323,10 +323,10 @@ fn where_half_of_the_cameras_see_something_steadily_beside_a_target_the_poses_ar
             );
             continue;
         };
-        let lately = |time: Timestamp| track.updated.seconds_since(time) < 1.0;
+        let lately = |time: Timestamp| track.updated_at.seconds_since(time) < 1.0;
         let cameras = track.residuals.values().filter(|residual| lately(residual.time)).count();
         assert!(cameras >= 3, "seed {seed}: {cameras} cameras agree");
-        let error = track.state().position() - circling()(track.updated.seconds()).unwrap();
+        let error = track.state().position() - circling()(track.updated_at.seconds()).unwrap();
         assert!(error.norm() < 2.0, "seed {seed}: {error}");
         squares
             .push(error.dot(&(track.state().position_covariance().try_inverse().unwrap() * error)));

@@ -383,8 +383,8 @@ fn table() {
     }
 }
 
-/// What all clocks are off by together shows in no sight line: tracks are early or late by it, and say
-/// by how much they may be.
+/// What all clocks are off by together shows in no sight line: tracks are early or late by it, and
+/// say by how much they may be.
 #[test]
 fn tracks_say_how_sure_their_time_is() {
     const CLOCK_SD_S: f64 = 0.05;

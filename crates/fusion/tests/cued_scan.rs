@@ -236,7 +236,7 @@ fn run(scene: &Scene, with: With, seed: u64) -> Found {
                         result.missed += 1;
                         continue;
                     };
-                    let truth = path(track.updated.seconds()).unwrap();
+                    let truth = path(track.updated_at.seconds()).unwrap();
                     result.errors_m.push((track.state().position() - truth).norm());
                 }
             }

@@ -263,7 +263,7 @@ fn a_narrow_camera_that_follows_cues_makes_the_track_better_and_the_track_knows_
                 turns += u32::from(head.turning > 0 && !was_turning);
                 was_turning = head.turning > 0;
                 let Some(track) = found(fusion, &scene.paths[0]) else { return };
-                let t = track.updated.seconds();
+                let t = track.updated_at.seconds();
                 if t < next {
                     return;
                 }

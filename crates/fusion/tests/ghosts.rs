@@ -6,7 +6,7 @@
 mod common;
 
 use common::{Path, Scene, found, fusion_of, site, straight};
-use crossfix_fusion::{Fusion, FusionConfig, Track, TrackStatus};
+use crossfix_fusion::{FusedTrack, Fusion, FusionConfig, TrackStatus};
 use crossfix_message::BearingFrame;
 use nalgebra::{Point3, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -81,7 +81,7 @@ fn ghosts_of_strangers(rotation_sd: f64, position_sd: f64) -> (usize, usize) {
 #[test]
 fn targets_that_one_camera_each_sees_make_next_to_no_tracks() {
     let (ghosts, epochs) = ghosts_of_strangers(0.0, 0.0);
-    // Before lines were held against each camera's own: 308 in 60.
+    // Before lines were compared with each camera's own: 308 in 60.
     assert!(ghosts * 2 <= epochs, "{ghosts} ghosts in {epochs} epochs");
     let (ghosts, epochs) = ghosts_of_strangers(1e-3, 0.05);
     // Lines that pass each other by the poses' 30 cm cross as true ones do. Before a shift counted
@@ -107,7 +107,7 @@ fn a_track_that_only_one_of_the_cameras_goes_on_seeing_is_a_direction_and_says_s
             }
             // As long as it is there, the truth lies within what it claims to know.
             for track in fusion.tracks().filter(|track| track.is_confirmed()) {
-                let error = track.state().position() - path()(track.updated.seconds()).unwrap();
+                let error = track.state().position() - path()(track.updated_at.seconds()).unwrap();
                 let spread = track.state().position_covariance().cholesky().unwrap();
                 assert!(error.dot(&spread.solve(&error)) < 30.0, "seed {seed}, {time} s: {error}");
                 followed += usize::from(time > 5.0);
@@ -120,8 +120,8 @@ fn a_track_that_only_one_of_the_cameras_goes_on_seeing_is_a_direction_and_says_s
 }
 
 /// Whether a track is more than four of its own deviations from where the target is.
-fn is_far_off(track: &Track, path: &Path) -> bool {
-    let error = track.state().position() - path(track.updated.seconds()).unwrap();
+fn is_far_off(track: &FusedTrack, path: &Path) -> bool {
+    let error = track.state().position() - path(track.updated_at.seconds()).unwrap();
     let spread = track.state().position_covariance().cholesky().unwrap();
     error.dot(&spread.solve(&error)) > 16.0
 }

@@ -72,8 +72,8 @@ fn finds_an_ordinary_target(fusion: &mut Fusion, from_s: f64) {
     fusion.flush();
     let truth = scene.paths.first().unwrap();
     let track = found(fusion, truth).unwrap();
-    let error = track.state().position() - truth(track.updated.seconds()).unwrap();
-    assert!(track.updated.seconds() > from_s + 3.8, "{track:?}");
+    let error = track.state().position() - truth(track.updated_at.seconds()).unwrap();
+    assert!(track.updated_at.seconds() > from_s + 3.8, "{track:?}");
     assert!(error.norm() < 0.2, "{error}");
 }
 

@@ -138,8 +138,8 @@ fn false_alarms(sites: u64, seconds: f64) -> usize {
     alarms
 }
 
-/// A network camera is timed by arrival until it says what its clock shows; what its times are off by
-/// before is another error than after.
+/// A network camera is timed by arrival until it says what its clock shows; what its times are off
+/// by before is another error than after.
 #[test]
 fn cameras_whose_clocks_become_known_are_not_accused() {
     let mut random = ChaCha8Rng::seed_from_u64(6);

@@ -39,7 +39,7 @@ fn run(config: FusionConfig, eyes: &[Eye], frames: &[BearingFrame]) -> (Vec<Outp
 type Seen = (u64, TrackStatus, Vector6<f64>, Matrix6<f64>);
 
 fn tracks(fusion: &Fusion) -> Vec<Seen> {
-    let seen = |track: &crossfix_fusion::Track| {
+    let seen = |track: &crossfix_fusion::FusedTrack| {
         (track.id.0, track.status, track.state().mean, track.state().covariance)
     };
     fusion.tracks().map(seen).collect()

@@ -52,7 +52,7 @@ fn error_m(fusion: &Fusion, ahead_s: f64) -> f64 {
     assert_eq!(fusion.tracks().filter(|track| track.is_confirmed()).count(), 1);
     let shown: Path = Box::new(move |t| path()(t - ahead_s));
     let track = found(fusion, &shown).unwrap();
-    (track.state().position() - shown(track.updated.seconds()).unwrap()).norm()
+    (track.state().position() - shown(track.updated_at.seconds()).unwrap()).norm()
 }
 
 #[test]

@@ -40,10 +40,7 @@ impl PanTilt {
     /// (azimuth) or a quarter of one (elevation).
     pub fn new(rest: Pose, azimuth: [f64; 2], elevation: [f64; 2]) -> Result<Self, GeometryError> {
         use std::f64::consts::{FRAC_PI_2, TAU};
-        let possible = |[least, most]: [f64; 2], bound: f64| {
-            (-bound..=bound).contains(&least) && (-bound..=bound).contains(&most) && least <= most
-        };
-        if possible(azimuth, TAU) && possible(elevation, FRAC_PI_2) {
+        if is_range_within(azimuth, TAU) && is_range_within(elevation, FRAC_PI_2) {
             Ok(Self { rest, azimuth, elevation })
         } else {
             Err(GeometryError::Reach)
@@ -100,6 +97,11 @@ fn nearest_turn(angle: f64, [least, most]: [f64; 2]) -> f64 {
     let beyond = |angle: &f64| (angle - angle.clamp(least, most)).abs();
     let nearest = turns.into_iter().min_by(|a, b| beyond(a).total_cmp(&beyond(b)));
     nearest.unwrap_or(angle).clamp(least, most)
+}
+
+/// Whether these are the least and the most of angles, neither farther from zero than the bound.
+fn is_range_within([least, most]: [f64; 2], bound: f64) -> bool {
+    (-bound..=bound).contains(&least) && (-bound..=bound).contains(&most) && least <= most
 }
 
 #[cfg(test)]

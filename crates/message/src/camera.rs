@@ -28,7 +28,7 @@ pub struct Calibration {
     pub camera: Camera,
     /// What turns it, if something does.
     pub mount: Option<PanTilt>,
-    /// Whether it looks for the targets that cues announce.
+    /// Whether it searches for the targets that cues announce.
     pub takes_cues: bool,
     /// Covariance of the pose in the world's axes, rotation about them (rad), then position (m);
     /// `None`: exact.
@@ -77,8 +77,8 @@ pub enum CalibrationError {
     /// The pose's covariance is not one: not finite, not symmetric, or negative along some axis; or
     /// it is so large that the pose counts as unknown ([`MOST_ROTATION_SD`], [`MOST_POSITION_SD`]).
     #[error(
-        "the calibration of camera `{camera}`: pose_covariance is no covariance, or of a pose that is not known \
-         to {MOST_ROTATION_SD} rad and {MOST_POSITION_SD} m"
+        "the calibration of camera `{camera}`: pose_covariance is no covariance, or of a pose \
+         that is not known to {MOST_ROTATION_SD} rad and {MOST_POSITION_SD} m"
     )]
     Covariance {
         /// The camera.
@@ -241,7 +241,8 @@ impl CameraCalibration {
         self.taking_cues()
     }
 
-    /// The same calibration for a camera that takes cues: it looks for what it is told to look for.
+    /// The same calibration for a camera that takes cues: it searches for the targets they
+    /// announce.
     #[must_use]
     pub fn taking_cues(mut self) -> Self {
         self.takes_cues = true;

@@ -41,9 +41,9 @@ pub struct Datum {
 impl Datum {
     /// Number of parameters by which a site may be off as a whole.
     pub const WAYS: usize = 9;
-    /// Index of the first turn among them, ...
+    /// Index of the first of three turns among them.
     pub const TURN: usize = 3;
-    /// ... and of growth.
+    /// Index of growth.
     pub const GROWTH: usize = 6;
     /// Index of lateness, the clocks' common offset.
     pub const LATE: usize = 7;

@@ -44,20 +44,20 @@ pub fn glance(channel: &Channel, bytes: &[u8]) -> Result<Option<Glance>, DecodeE
     seen.map(Some)
 }
 
-/// Numbers of the field `version` of every message, and of `major` in it.
+/// Number of the field `version` of every message.
 const VERSION_TAG: u32 = 1;
+/// Number of the field `major` in `version`.
 const MAJOR_TAG: u32 = 1;
 
 fn of<M: Payload>(bytes: &[u8]) -> Result<Glance, DecodeError> {
     let mut seen = Glance { time: Timestamp::EPOCH, is_readable: true };
     let read = fields(bytes, |tag, value| {
         match value {
-            Value::Bytes(version) if tag == VERSION_TAG => fields(version, |tag, value| {
-                if let (MAJOR_TAG, Value::Varint(major)) = (tag, value) {
+            Value::Bytes(version) if tag == VERSION_TAG => {
+                if let Some(major) = major(version)? {
                     seen.is_readable = major <= u64::from(VERSION.major);
                 }
-                Ok(true)
-            })?,
+            }
             Value::SixtyFour(nanos) if tag == M::TIME_TAG => {
                 seen.time = Timestamp::from_nanos(i64::from_le_bytes(nanos));
             }
@@ -67,6 +67,18 @@ fn of<M: Payload>(bytes: &[u8]) -> Result<Glance, DecodeError> {
     });
     read.map_err(|source| DecodeError::Malformed { schema: M::SCHEMA, source })?;
     Ok(seen)
+}
+
+/// The field `major` of the bytes of a version.
+fn major(version: &[u8]) -> Result<Option<u64>, prost::DecodeError> {
+    let mut found = None;
+    fields(version, |tag, value| {
+        if let (MAJOR_TAG, Value::Varint(major)) = (tag, value) {
+            found = Some(major);
+        }
+        Ok(true)
+    })?;
+    Ok(found)
 }
 
 #[cfg(test)]

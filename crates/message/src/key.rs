@@ -26,7 +26,7 @@ pub enum Channel {
     Smoothed,
     /// `fusion/events`: [`crate::TrackEvent`].
     Events,
-    /// `fusion/cues`: [`crate::CueFrame`], what each camera that takes cues should look for.
+    /// `fusion/cues`: [`crate::CueFrame`], what each camera that takes cues should search for.
     Cues,
     /// `fusion/health`: [`crate::Health`], once a second.
     FusionHealth,

@@ -9,12 +9,12 @@ use crate::{
 
 /// The longest message that is accepted or recorded, bytes. The largest real ones are previews
 /// (about 100 kB) and frames of a thousand tracks (about 1 MB). With half of it frames of four
-/// thousand tracks still pass.
+/// thousand tracks are still accepted.
 pub const MOST_MESSAGE_BYTES: usize = 8 << 20;
 
 /// The most memory that a decoded message may take, bytes: 80 000 bearings. Lists double as they
 /// grow, so that decoding one takes twice as much for a moment. With half of it a frame of 40 000
-/// bearings still passes; with twice as much one hostile message takes 64 MB.
+/// bearings is still accepted; with twice as much one hostile message takes 64 MB.
 pub const MOST_DECODED_BYTES: usize = 16 << 20;
 
 /// A list in a message that may be larger in memory than on the wire: an empty element has two
@@ -33,18 +33,24 @@ const fn list<T>(tag: u32, inside: &'static [Repeated]) -> Repeated {
     Repeated { tag, bytes: size_of::<T>(), inside }
 }
 
+/// No lists.
 pub(crate) const NOTHING: &[Repeated] = &[];
+/// The lists of a [`crate::BearingFrame`].
 pub(crate) const BEARING_FRAME: &[Repeated] =
     &[list::<BearingTrack>(8, NOTHING), list::<TakenOver>(10, NOTHING)];
+/// The lists of a [`crate::TrackFrame`].
 pub(crate) const TRACK_FRAME: &[Repeated] =
     &[list::<Track>(6, &[list::<CameraResidual>(6, NOTHING)])];
+/// The lists of a [`crate::CueFrame`].
 pub(crate) const CUE_FRAME: &[Repeated] = &[list::<Cue>(4, &[list::<Expected>(2, NOTHING)])];
+/// The lists of a [`crate::Health`].
 pub(crate) const HEALTH: &[Repeated] = &[
     list::<Counter>(5, NOTHING),
     list::<CameraHealth>(7, NOTHING),
     list::<String>(10, NOTHING),
     list::<String>(12, NOTHING),
 ];
+/// The lists of a [`crate::TruthFrame`].
 pub(crate) const TRUTH_FRAME: &[Repeated] = &[list::<TrueState>(3, NOTHING)];
 
 /// Memory that a decoded message takes, bytes; at least as many as it has on the wire. Counting

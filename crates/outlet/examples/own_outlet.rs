@@ -1,4 +1,4 @@
-//! An outlet of one's own: a line of text a target, for whoever reads lines.
+//! An outlet of one's own: one line of text per target, for whoever reads lines.
 //!
 //! `cargo run -p crossfix-outlet --example own_outlet`
 
@@ -39,7 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut situation = Situation::new("airfield".parse()?, anchor);
     let mut outlet = Lines;
     for second in 0..3 {
-        situation.hear(
+        situation.add_tracks(
             None,
             &TrackFrame {
                 time_ns: Timestamp::from_seconds(f64::from(second)).nanos(),

@@ -10,8 +10,9 @@ use crate::{Outlet, Snapshot, Target};
 const CATEGORY: u8 = 62;
 /// Items of a record (FSPEC): 010 070 105 185, 040 080, 130, 220 500.
 const ITEMS: [u8; 4] = [0x9B, 0x0D, 0x15, 0x04];
-/// Bytes of a block before its records, and of one record.
+/// Bytes of a block before its records: category and length.
 const HEAD_BYTES: usize = 3;
+/// Bytes of one record, with the items of [`ITEMS`].
 const RECORD_BYTES: usize = 42;
 /// Most records of a block, so that it fits into one datagram of an ordinary network.
 const MOST_RECORDS: usize = (1400 - HEAD_BYTES) / RECORD_BYTES;
@@ -20,13 +21,19 @@ const MOST_RECORDS: usize = (1400 - HEAD_BYTES) / RECORD_BYTES;
 /// into one.
 const NUMBER_RESTS_S: f64 = 60.0;
 
-/// Resolution of the items: the value of their last bits.
+/// Value of the last bit of latitude and longitude (item 105), degrees.
 const DEGREE_LSB: f64 = 180.0 / (1 << 25) as f64;
+/// Value of the last bit of the horizontal velocity (item 185), m/s.
 const VELOCITY_LSB_MPS: f64 = 0.25;
+/// A foot, m: ASTERIX gives heights in feet.
 const FOOT_M: f64 = 0.3048;
+/// Value of the last bit of the height (item 130), m.
 const ALTITUDE_LSB_M: f64 = 6.25 * FOOT_M;
+/// Value of the last bit of the rate of climb (item 220, feet per minute), m/s.
 const CLIMB_LSB_MPS: f64 = 6.25 * FOOT_M / 60.0;
+/// Value of the last bit of the time of day (item 070), s.
 const TIME_LSB_S: f64 = 1.0 / 128.0;
+/// Seconds of a day, after which the time of day begins at zero again.
 const DAY_S: f64 = 86_400.0;
 /// Metres per degree of a great circle, to a third of a percent: used for standard deviations only.
 const DEGREE_M: f64 = 111_320.0;
@@ -72,8 +79,9 @@ impl Asterix {
 
 /// Time since midnight, UTC, item 070.
 fn time_of_day(time: Timestamp) -> u32 {
-    const NANOS_A_DAY: i64 = 86_400_000_000_000;
-    let seconds = time.nanos().rem_euclid(NANOS_A_DAY) as f64 * 1e-9;
+    /// Nanoseconds of a day.
+    const NANOS_PER_DAY: i64 = 86_400_000_000_000;
+    let seconds = time.nanos().rem_euclid(NANOS_PER_DAY) as f64 * 1e-9;
     (seconds / TIME_LSB_S).round().rem_euclid(DAY_S / TIME_LSB_S) as u32
 }
 
@@ -81,8 +89,8 @@ fn time_of_day(time: Timestamp) -> u32 {
 fn signed<const BYTES: usize>(value: f64) -> [u8; BYTES] {
     let most = (1_i64 << (8 * BYTES - 1)) - 1;
     // The cast saturates beyond the range, and turns NaN into 0.
-    let held = (value.round() as i64).clamp(-most - 1, most);
-    let bytes = held.to_be_bytes();
+    let clamped = (value.round() as i64).clamp(-most - 1, most);
+    let bytes = clamped.to_be_bytes();
     std::array::from_fn(|k| bytes[8 - BYTES + k])
 }
 
@@ -92,8 +100,8 @@ fn deviation<const BYTES: usize>(sd: f64, step: f64) -> [u8; BYTES] {
     let most = (1_u64 << (8 * BYTES)) - 1;
     // What is no number is as bad as can be said: the cast would make it the best.
     let steps = if sd.is_nan() { f64::INFINITY } else { (sd / step).ceil() };
-    let held = (steps as u64).clamp(1, most);
-    let bytes = held.to_be_bytes();
+    let clamped = (steps as u64).clamp(1, most);
+    let bytes = clamped.to_be_bytes();
     std::array::from_fn(|k| bytes[8 - BYTES + k])
 }
 
@@ -107,9 +115,11 @@ fn status(state: TrackState, is_new: bool) -> [u8; 5] {
     const SRC_TRIANGULATION: u8 = 3 << 2;
     /// Tentative track.
     const CNF: u8 = 0x02;
-    /// Last and first message of the track.
+    /// Last message of the track.
     const TSE: u8 = 0x40;
+    /// First message of the track.
     const TSB: u8 = 0x20;
+    /// Extrapolated, as nothing has seen it lately.
     const COASTING: u8 = 0x80;
     /// Not seen by radar of any kind.
     const NO_RADAR: u8 = 0x78;
@@ -192,9 +202,9 @@ impl TrackNumbers {
     /// last.
     fn free(&mut self, now: Timestamp) -> u16 {
         self.resting.retain(|_, lost| now.seconds_since(*lost) < NUMBER_RESTS_S);
-        let taken: std::collections::BTreeSet<u16> =
+        let used: std::collections::BTreeSet<u16> =
             self.given.values().chain(self.resting.keys()).copied().collect();
-        (1..=u16::MAX).find(|number| !taken.contains(number)).unwrap_or(u16::MAX)
+        (1..=u16::MAX).find(|number| !used.contains(number)).unwrap_or(u16::MAX)
     }
 }
 

@@ -6,7 +6,7 @@ use crate::target::{Motion, Target};
 use crate::text::utc;
 use crate::{Outlet, Snapshot};
 
-/// Type of a target if none is configured: unknown, in the air. It claims nothing more.
+/// Type of a target if none is configured: unknown, in the air. It says nothing more.
 const UNKNOWN_IN_THE_AIR: &str = "a-u-A";
 /// Time after its last event when a target is no longer valid, s. With half of it targets go stale
 /// where a link stalls for five seconds; with twice as much, those of a fusion centre that is gone
@@ -20,7 +20,7 @@ const DEGREE_DIGITS: usize = 7;
 /// clients.
 ///
 /// `ce` and `le` are the schema's "one sigma point": the standard deviation in the horizontal
-/// direction in which it is largest, and that of the height above the ellipsoid. `how` tells how
+/// direction in which it is largest, and that of the height above the ellipsoid. `how` says how
 /// the position was obtained: `m-f` fused from several cameras, `m-i` measured in one camera's
 /// images alone, `m-p` predicted while no camera sees the target.
 #[derive(Clone, Debug)]
@@ -55,8 +55,8 @@ impl CursorOnTarget {
         format!(
             "<?xml version=\"1.0\" encoding=\"UTF-8\" standalone=\"yes\"?>\
              <event version=\"2.0\" uid=\"crossfix.{site}.{}\" type=\"{}\" how=\"{how}\" \
-             time=\"{now}\" start=\"{now}\" stale=\"{stale}\">{}<detail><contact callsign=\"XF-{number}\"/>\
-             {}<precisionlocation geopointsrc=\"CALC\" altsrc=\"CALC\"/>\
+             time=\"{now}\" start=\"{now}\" stale=\"{stale}\">{}<detail><contact \
+             callsign=\"XF-{number}\"/>{}<precisionlocation geopointsrc=\"CALC\" altsrc=\"CALC\"/>\
              <remarks>Crossfix track {number} of {site}: {}</remarks></detail></event>",
             target.id,
             self.kind,
@@ -72,7 +72,8 @@ fn point(target: &Target) -> String {
     // The schema requires a value above zero.
     let sd = |value: f64| format!("{:.2}", value.max(0.01));
     format!(
-        "<point lat=\"{:.DEGREE_DIGITS$}\" lon=\"{:.DEGREE_DIGITS$}\" hae=\"{:.2}\" ce=\"{}\" le=\"{}\"/>",
+        "<point lat=\"{:.DEGREE_DIGITS$}\" lon=\"{:.DEGREE_DIGITS$}\" hae=\"{:.2}\" ce=\"{}\" \
+         le=\"{}\"/>",
         target.place.latitude_deg(),
         target.place.longitude_deg(),
         target.place.height(),
@@ -87,8 +88,8 @@ fn track(motion: &Motion) -> String {
     let course = format!("{:.2}", course_deg.value);
     let course = if course == "360.00" { "0.00" } else { &course };
     format!(
-        "<track course=\"{course}\" speed=\"{:.2}\" slope=\"{:.2}\" eCourse=\"{:.2}\" eSpeed=\"{:.2}\" \
-         eSlope=\"{:.2}\"/>",
+        "<track course=\"{course}\" speed=\"{:.2}\" slope=\"{:.2}\" eCourse=\"{:.2}\" \
+         eSpeed=\"{:.2}\" eSlope=\"{:.2}\"/>",
         speed_mps.value, slope_deg.value, course_deg.sd, speed_mps.sd, slope_deg.sd
     )
 }

@@ -50,7 +50,7 @@ pub struct FoxgloveMessage {
 
 /// Whether pictures are written in Foxglove's schema too: they are most of a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Pictures {
+pub enum PictureExport {
     /// They are written.
     Said,
     /// They are left out.
@@ -60,7 +60,7 @@ pub enum Pictures {
 /// Translates the messages of a site's channels into Foxglove's schemas.
 #[derive(Debug)]
 pub struct FoxgloveView {
-    pictures: Pictures,
+    pictures: PictureExport,
     situation: Option<Situation>,
     said_at: Option<Timestamp>,
 }
@@ -70,7 +70,7 @@ impl FoxgloveView {
     pub fn new(
         site: &crossfix_message::SiteName,
         anchor: Option<Geodetic>,
-        pictures: Pictures,
+        pictures: PictureExport,
     ) -> Self {
         let situation = anchor.map(|anchor| Situation::new(site.clone(), anchor));
         Self { pictures, situation, said_at: None }
@@ -80,17 +80,19 @@ impl FoxgloveView {
     /// message give none.
     pub fn of(&mut self, key: &Key, data: &[u8], time: Timestamp) -> Vec<FoxgloveMessage> {
         match &key.channel {
-            // The channel tells which camera it is: a message that names another one is ignored.
+            // The channel says which camera it is: a message that names another one is ignored.
             Channel::Calibration(camera) => decode::<CameraCalibration>(data)
                 .ok()
                 .filter(|message| message.camera == camera.as_str())
                 .map(|message| self.of_calibration(&message, time))
                 .unwrap_or_default(),
-            Channel::Preview(camera) if self.pictures == Pictures::Said => decode::<Preview>(data)
-                .ok()
-                .filter(|message| message.camera == camera.as_str())
-                .map(|message| vec![of_preview(message)])
-                .unwrap_or_default(),
+            Channel::Preview(camera) if self.pictures == PictureExport::Said => {
+                decode::<Preview>(data)
+                    .ok()
+                    .filter(|message| message.camera == camera.as_str())
+                    .map(|message| vec![of_preview(message)])
+                    .unwrap_or_default()
+            }
             Channel::Tracks => decode::<TrackFrame>(data)
                 .map(|message| self.of_tracks(key.area.as_ref(), &message))
                 .unwrap_or_default(),
@@ -104,7 +106,7 @@ impl FoxgloveView {
         time: Timestamp,
     ) -> Vec<FoxgloveMessage> {
         if let Some(situation) = &mut self.situation {
-            situation.hear_calibration(message);
+            situation.add_calibration(message);
         }
         let camera = &message.camera;
         let lens = said(format!("/camera/{camera}/calibration"), time, &lens_of(message, time));
@@ -116,7 +118,7 @@ impl FoxgloveView {
 
     fn of_tracks(&mut self, area: Option<&AreaName>, frame: &TrackFrame) -> Vec<FoxgloveMessage> {
         if let Some(situation) = &mut self.situation {
-            situation.hear(area, frame);
+            situation.add_tracks(area, frame);
         }
         let time = Timestamp::from_nanos(frame.time_ns);
         if self.said_at.is_some_and(|at| (0.0..PLACE_PERIOD_S).contains(&time.seconds_since(at))) {
@@ -151,6 +153,7 @@ fn said<M: Named>(topic: String, time: Timestamp, message: &M) -> FoxgloveMessag
 }
 
 fn stamp(time: Timestamp) -> Option<prost_types::Timestamp> {
+    /// A second, ns.
     const SECOND: i64 = 1_000_000_000;
     let nanos = i32::try_from(time.nanos().rem_euclid(SECOND)).unwrap_or(0);
     Some(prost_types::Timestamp { seconds: time.nanos().div_euclid(SECOND), nanos })
@@ -217,8 +220,7 @@ fn topic_of(track_id: u64, what: &str) -> String {
 
 /// A sure track's position in the site's frame; `None` if the track is not sure.
 fn pose_of(track: &Track, time: Timestamp) -> Option<FoxgloveMessage> {
-    let is_sure = matches!(track.state(), TrackState::Confirmed | TrackState::Coasting);
-    let position = track.position.filter(|_| is_sure)?;
+    let position = track.position.filter(|_| is_sure(track.state()))?;
     let pose = wire::PoseInFrame {
         timestamp: stamp(time),
         frame_id: SITE_FRAME.to_owned(),
@@ -232,11 +234,13 @@ fn pose_of(track: &Track, time: Timestamp) -> Option<FoxgloveMessage> {
 
 /// The positions of the sure targets on the Earth.
 fn fixes_of(snapshot: &crate::Snapshot) -> Vec<FoxgloveMessage> {
-    let is_there = |target: &&crate::Target| {
-        matches!(target.state, TrackState::Confirmed | TrackState::Coasting)
-    };
-    let there = snapshot.targets.iter().filter(is_there);
-    there.map(|target| fix_of(target, snapshot.time)).collect()
+    let sure = snapshot.targets.iter().filter(|target| is_sure(target.state));
+    sure.map(|target| fix_of(target, snapshot.time)).collect()
+}
+
+/// Whether a track of this state has a position that Foxglove should show.
+fn is_sure(state: TrackState) -> bool {
+    matches!(state, TrackState::Confirmed | TrackState::Coasting)
 }
 
 fn fix_of(target: &crate::Target, time: Timestamp) -> FoxgloveMessage {

@@ -74,7 +74,7 @@ pub(crate) struct Flights {
 }
 
 impl Flights {
-    pub fn hear(&mut self, snapshot: &Snapshot) {
+    pub fn add(&mut self, snapshot: &Snapshot) {
         let is_there = |target: &&Target| target.state != crossfix_message::TrackState::Lost;
         for target in snapshot.targets.iter().filter(is_there) {
             let passed = Passed { time: snapshot.time, position: position(target) };
@@ -92,28 +92,30 @@ pub struct GeoJsonFlights {
 
 impl Outlet for GeoJsonFlights {
     fn tracks(&mut self, snapshot: &Snapshot) -> Vec<Vec<u8>> {
-        self.flights.hear(snapshot);
+        self.flights.add(snapshot);
         Vec::new()
     }
 
     fn farewell(&mut self, _now: Timestamp) -> Vec<Vec<u8>> {
-        let features: Vec<Value> = std::mem::take(&mut self.flights.tracks)
-            .into_iter()
-            .map(|(id, flight)| {
-                let times: Vec<String> = flight.iter().map(|passed| utc(passed.time)).collect();
-                let line: Vec<[f64; 3]> = flight.iter().map(|passed| passed.position).collect();
-                let geometry = match line[..] {
-                    [place] => json!({ "type": "Point", "coordinates": place }),
-                    _ => json!({ "type": "LineString", "coordinates": line }),
-                };
-                let number = crossfix_message::TrackNumber(id).to_string();
-                json!({
-                    "type": "Feature", "id": id.to_string(), "geometry": geometry,
-                    "properties": { "track": number, "coordTimes": times },
-                })
-            })
-            .collect();
+        let flights = std::mem::take(&mut self.flights.tracks).into_iter();
+        let features: Vec<Value> =
+            flights.map(|(id, flight)| flight_feature(id, &flight)).collect();
         let collection = json!({ "type": "FeatureCollection", "features": features });
         vec![collection.to_string().into_bytes()]
     }
+}
+
+/// A track's flight as a GeoJSON feature.
+fn flight_feature(id: u64, flight: &[Passed]) -> Value {
+    let times: Vec<String> = flight.iter().map(|passed| utc(passed.time)).collect();
+    let line: Vec<[f64; 3]> = flight.iter().map(|passed| passed.position).collect();
+    let geometry = match line[..] {
+        [place] => json!({ "type": "Point", "coordinates": place }),
+        _ => json!({ "type": "LineString", "coordinates": line }),
+    };
+    let number = crossfix_message::TrackNumber(id).to_string();
+    json!({
+        "type": "Feature", "id": id.to_string(), "geometry": geometry,
+        "properties": { "track": number, "coordTimes": times },
+    })
 }

@@ -28,9 +28,10 @@ impl Kml {
     fn document(&self) -> String {
         let mut text = String::from(
             "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n\
-             <kml xmlns=\"http://www.opengis.net/kml/2.2\" xmlns:gx=\"http://www.google.com/kml/ext/2.2\">\
-             <Document><name>Crossfix</name>\n\
-             <Style id=\"track\"><LineStyle><color>ff00a5ff</color><width>2</width></LineStyle></Style>\n",
+             <kml xmlns=\"http://www.opengis.net/kml/2.2\" \
+             xmlns:gx=\"http://www.google.com/kml/ext/2.2\"><Document><name>Crossfix</name>\n\
+             <Style \
+             id=\"track\"><LineStyle><color>ff00a5ff</color><width>2</width></LineStyle></Style>\n",
         );
         for (id, flight) in &self.flights.tracks {
             let number = TrackNumber(*id);
@@ -59,7 +60,7 @@ impl Kml {
 
 impl Outlet for Kml {
     fn tracks(&mut self, snapshot: &Snapshot) -> Vec<Vec<u8>> {
-        self.flights.hear(snapshot);
+        self.flights.add(snapshot);
         Vec::new()
     }
 

@@ -25,7 +25,7 @@
 //! let anchor = Geodetic::from_degrees(48.3538, 11.7861, 490.0)?;
 //! let mut situation = Situation::new("airfield".parse()?, anchor);
 //! let covariance = (0..36).map(|k| if k % 7 == 0 { 0.01 } else { 0.0 }).collect();
-//! situation.hear(None, &TrackFrame {
+//! situation.add_tracks(None, &TrackFrame {
 //!     time_ns: 1_790_000_000_000_000_000,
 //!     tracks: vec![Track {
 //!         id: 7,

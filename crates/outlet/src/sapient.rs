@@ -64,6 +64,7 @@ impl Sapient {
     }
 
     fn frame(&self, time: Timestamp, content: Content) -> Vec<u8> {
+        /// A second, ns.
         const SECOND: i64 = 1_000_000_000;
         let message = sapient::SapientMessage {
             timestamp: Some(prost_types::Timestamp {
@@ -141,6 +142,7 @@ fn digest(texts: &[&str]) -> [u8; 16] {
 /// An identifier as SAPIENT requires it (ULID): 48 bits of time, ms, and 80 bits of a digest of
 /// what it identifies.
 fn ulid(node: &str, kind: &str, of: &str, time: Timestamp) -> String {
+    /// Crockford's base 32, in which ULIDs are written.
     const DIGITS: &[u8; 32] = b"0123456789ABCDEFGHJKMNPQRSTVWXYZ";
     let ms = u64::try_from(time.nanos() / 1_000_000).unwrap_or(0) & ((1 << 48) - 1);
     let hash = digest(&[node, kind, of]);
@@ -169,6 +171,11 @@ fn location(target: &Target) -> sapient::Location {
         datum: Some(sapient::LocationDatum::Wgs84E.into()),
         ..Default::default()
     }
+}
+
+/// Time since something was sent, s. If it never was, or time has gone back, it is due.
+fn since(at: Option<Timestamp>, now: Timestamp) -> f64 {
+    at.map(|at| now.seconds_since(at)).filter(|s| *s >= 0.0).unwrap_or(f64::INFINITY)
 }
 
 fn velocity(target: &Target) -> sapient::EnuVelocity {
@@ -317,15 +324,11 @@ impl Outlet for Sapient {
 
     fn tracks(&mut self, snapshot: &Snapshot) -> Vec<Vec<u8>> {
         let time = snapshot.time;
-        // If time has gone back, everything is due.
-        let since = |at: Option<Timestamp>| {
-            at.map(|at| time.seconds_since(at)).filter(|s| *s >= 0.0).unwrap_or(f64::INFINITY)
-        };
         let mut said = Vec::new();
-        if since(self.status_at) >= STATUS_PERIOD_S {
+        if since(self.status_at, time) >= STATUS_PERIOD_S {
             said.push(self.status(time, sapient::status_report::System::Ok));
         }
-        if since(self.said_at) < DETECTION_PERIOD_S {
+        if since(self.said_at, time) < DETECTION_PERIOD_S {
             return said;
         }
         self.said_at = Some(time);

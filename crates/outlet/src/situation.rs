@@ -35,7 +35,7 @@ pub struct Snapshot {
 
 /// A track as it was last heard, in the site's axes.
 #[derive(Clone, Debug)]
-struct Known {
+struct KnownTrack {
     state: TrackState,
     time: Timestamp,
     time_sd_s: f64,
@@ -52,7 +52,7 @@ pub struct Situation {
     frame: LocalFrame,
     /// The error that the whole site has in common.
     datum: Option<Datum>,
-    tracks: BTreeMap<u64, Known>,
+    tracks: BTreeMap<u64, KnownTrack>,
     /// The newest time heard from each fusion centre, by its area.
     newest: BTreeMap<Option<AreaName>, Timestamp>,
     now: Option<Timestamp>,
@@ -62,7 +62,7 @@ fn is_sure(state: TrackState) -> bool {
     matches!(state, TrackState::Confirmed | TrackState::Coasting | TrackState::OneCamera)
 }
 
-impl Known {
+impl KnownTrack {
     /// Reads a track of a message; `None` if it has no position, or a number is not finite.
     fn parse(track: &Track, frame: &TrackFrame) -> Option<Self> {
         let covariance = <[f64; 36]>::try_from(track.covariance.as_slice()).ok()?;
@@ -126,14 +126,14 @@ impl Situation {
 
     /// Takes in a calibration: the error that it states for the whole site is part of all tracks'
     /// covariances from then on.
-    pub fn hear_calibration(&mut self, calibration: &CameraCalibration) {
+    pub fn add_calibration(&mut self, calibration: &CameraCalibration) {
         let datum = calibration.datum.as_ref().and_then(|datum| datum.parse());
         self.datum = datum.or(self.datum.take());
     }
 
     /// Takes in the tracks of a fusion centre: that of `area`, if there are several. A track
     /// without a position, or with a number that is not finite, is left out.
-    pub fn hear(&mut self, area: Option<&AreaName>, frame: &TrackFrame) {
+    pub fn add_tracks(&mut self, area: Option<&AreaName>, frame: &TrackFrame) {
         let time = Timestamp::from_nanos(frame.time_ns);
         let area = area.cloned();
         if self.newest.get(&area).is_some_and(|newest| newest.seconds_since(time) > SILENCE_S) {
@@ -154,7 +154,7 @@ impl Situation {
             if !is_news || (!was_sure && self.tracks.len() >= MOST_TRACKS) {
                 continue;
             }
-            match (Known::parse(track, frame), self.tracks.get_mut(&track.id)) {
+            match (KnownTrack::parse(track, frame), self.tracks.get_mut(&track.id)) {
                 (Some(known), _) => drop(self.tracks.insert(track.id, known)),
                 // A lost track may come without its position.
                 (None, Some(known)) => known.state = track.state(),
@@ -219,8 +219,8 @@ mod tests {
     fn all_tracks_are_said_at_one_time_with_what_it_is_off_by() {
         let mut situation = situation();
         assert_eq!(situation.snapshot(0.0), None);
-        situation.hear(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
-        situation.hear(None, &frame(0.5, 2, TrackState::Confirmed, 0.0));
+        situation.add_tracks(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
+        situation.add_tracks(None, &frame(0.5, 2, TrackState::Confirmed, 0.0));
         let snapshot = situation.snapshot(0.0).unwrap();
         assert_eq!(snapshot.time, Timestamp::from_seconds(START + 0.5));
         let [one, two] = &snapshot.targets[..] else { panic!("{snapshot:?}") };
@@ -237,11 +237,11 @@ mod tests {
     #[test]
     fn a_lost_track_is_said_once_and_one_that_is_not_sure_never() {
         let mut situation = situation();
-        situation.hear(None, &frame(0.0, 1, TrackState::Tentative, 0.0));
+        situation.add_tracks(None, &frame(0.0, 1, TrackState::Tentative, 0.0));
         assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
-        situation.hear(None, &frame(0.1, 1, TrackState::Confirmed, 0.0));
+        situation.add_tracks(None, &frame(0.1, 1, TrackState::Confirmed, 0.0));
         assert_eq!(situation.snapshot(0.0).unwrap().targets[0].state, TrackState::Confirmed);
-        situation.hear(None, &frame(0.2, 1, TrackState::Lost, 0.0));
+        situation.add_tracks(None, &frame(0.2, 1, TrackState::Lost, 0.0));
         assert_eq!(situation.snapshot(0.0).unwrap().targets[0].state, TrackState::Lost);
         assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
     }
@@ -249,8 +249,8 @@ mod tests {
     #[test]
     fn tracks_of_a_fusion_centre_that_is_gone_are_lost() {
         let mut situation = situation();
-        situation.hear(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
-        situation.hear(None, &frame(3.0, 2, TrackState::Confirmed, 0.0));
+        situation.add_tracks(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
+        situation.add_tracks(None, &frame(3.0, 2, TrackState::Confirmed, 0.0));
         let states: Vec<_> =
             situation.snapshot(0.0).unwrap().targets.iter().map(|target| target.state).collect();
         assert_eq!(states, [TrackState::Lost, TrackState::Confirmed]);
@@ -259,7 +259,7 @@ mod tests {
     #[test]
     fn tracks_of_a_fusion_centre_that_says_nothing_any_more_are_lost_once() {
         let mut situation = situation();
-        situation.hear(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
+        situation.add_tracks(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
         assert_eq!(situation.snapshot(1.0).unwrap().targets[0].state, TrackState::Confirmed);
         assert_eq!(situation.snapshot(2.5).unwrap().targets[0].state, TrackState::Lost);
         assert!(situation.snapshot(3.5).unwrap().targets.is_empty());
@@ -268,8 +268,8 @@ mod tests {
     #[test]
     fn where_time_goes_back_what_is_heard_then_counts() {
         let mut situation = situation();
-        situation.hear(None, &frame(100.0, 1, TrackState::Confirmed, 0.0));
-        situation.hear(None, &frame(0.0, 2, TrackState::Confirmed, 0.0));
+        situation.add_tracks(None, &frame(100.0, 1, TrackState::Confirmed, 0.0));
+        situation.add_tracks(None, &frame(0.0, 2, TrackState::Confirmed, 0.0));
         let snapshot = situation.snapshot(0.0).unwrap();
         assert_eq!(snapshot.time, Timestamp::from_seconds(START));
         assert_eq!(snapshot.targets.iter().map(|target| target.id).collect::<Vec<_>>(), [2]);
@@ -279,9 +279,9 @@ mod tests {
     fn numbers_that_are_none_are_left_out() {
         let mut situation = situation();
         let mut bad = frame(0.0, 1, TrackState::Confirmed, f64::NAN);
-        situation.hear(None, &bad);
+        situation.add_tracks(None, &bad);
         bad.tracks[0].position = None;
-        situation.hear(None, &bad);
+        situation.add_tracks(None, &bad);
         assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
     }
 }

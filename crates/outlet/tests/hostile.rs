@@ -1,4 +1,5 @@
-//! What others are told of messages that nobody meant: those that the fuzzer begins from, and any bytes.
+//! What others are told of messages that nobody meant: those that the fuzzer begins from, and any
+//! bytes.
 
 #![allow(
     clippy::unwrap_used,

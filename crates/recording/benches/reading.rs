@@ -1,5 +1,5 @@
-//! Reading a recording, beside the mcap crate's own stream of the same bytes, which checks no damage
-//! and hands out no keys. Seventy hundredths of its speed are asked for.
+//! Reading a recording, beside the mcap crate's own stream of the same bytes, which checks no
+//! damage and hands out no keys. Seventy hundredths of its speed are asked for.
 //!
 //! `cargo bench -p crossfix-recording`
 #![allow(clippy::unwrap_used, reason = "a bench that cannot set itself up has nothing to say")]

@@ -8,7 +8,7 @@ use mcap::{McapError, McapResult};
 
 /// Bytes of a record's head: opcode (1) and length (8).
 pub(crate) const HEAD_BYTES: usize = 9;
-/// Longest record that is read, bytes; a longer one is skipped, and a chunk that claims to hold
+/// Longest record that is read, bytes; a longer one is skipped, and a chunk that states
 /// more is not unpacked. The writer closes a chunk at half a megabyte and takes no message above 8
 /// MB, so its own records are shorter. With half of it the same, but that chunks of other programs
 /// are left out from 32 MB on.
@@ -50,21 +50,27 @@ pub(crate) fn has_shape(body: &[u8]) -> bool {
 
 /// Offset of the first chunk in some bytes; `left` bytes of the file are left from their beginning.
 pub(crate) fn find(bytes: &[u8], left: u64) -> Option<usize> {
-    let u64_at = |at: usize| Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?));
     (0..bytes.len().saturating_sub(LOOKS_BYTES - 1)).find(|&at| {
-        let name = at + LOOKS_BYTES - 8 - COMPRESSION.len();
-        // The opcode may be what is damaged, so it is not compared. The record's length must agree
-        // with that of its packed part.
-        bytes[name - 4..name] == [4, 0, 0, 0]
-            && bytes[name..].starts_with(COMPRESSION)
-            && u64_at(at + 1).zip(u64_at(name + COMPRESSION.len())).is_some_and(
-                |(length, packed)| {
-                    length == packed.saturating_add(FIXED_BYTES)
-                        && length <= MAX_RECORD_BYTES
-                        && length <= left.saturating_sub((at + HEAD_BYTES) as u64)
-                },
-            )
+        begins_chunk(&bytes[at..at + LOOKS_BYTES], left.saturating_sub((at + HEAD_BYTES) as u64))
     })
+}
+
+/// Whether `LOOKS_BYTES` bytes begin a chunk whose body has at most `left` bytes. The opcode may be
+/// what is damaged, so it is not compared.
+fn begins_chunk(bytes: &[u8], left: u64) -> bool {
+    let name = LOOKS_BYTES - 8 - COMPRESSION.len();
+    if bytes[name - 4..name] != [4, 0, 0, 0] || !bytes[name..].starts_with(COMPRESSION) {
+        return false;
+    }
+    // The record's length must agree with that of its packed part.
+    let lengths = u64_at(bytes, 1).zip(u64_at(bytes, name + COMPRESSION.len()));
+    lengths.is_some_and(|(length, packed)| {
+        length == packed.saturating_add(FIXED_BYTES) && length <= MAX_RECORD_BYTES && length <= left
+    })
+}
+
+fn u64_at(bytes: &[u8], at: usize) -> Option<u64> {
+    Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?))
 }
 
 /// Number of bytes of a record's body that belong to the chunk, as the chunk itself states it; only

@@ -67,46 +67,57 @@ pub struct RecordingInfo {
     pub damage: Option<Damage>,
 }
 
+/// What the messages read so far say of a recording's contents.
+#[derive(Default)]
+struct MessageSummary {
+    /// By topic.
+    channels: BTreeMap<String, ChannelInfo>,
+    cameras: BTreeSet<CameraName>,
+    newer: u64,
+    health: BTreeMap<String, LastHealth>,
+}
+
+impl MessageSummary {
+    fn add(&mut self, entry: &Entry) {
+        self.health.extend(LastHealth::read(entry));
+        let seen = glance(&entry.key.channel, &entry.data).ok().flatten();
+        self.newer += u64::from(seen.is_some_and(|seen| !seen.is_readable));
+        self.cameras.extend(entry.key.channel.camera().cloned());
+        let topic = entry.key.to_string();
+        let channel = self.channels.entry(topic.clone()).or_insert_with(|| ChannelInfo {
+            topic,
+            schema: schema_of(&entry.key.channel).unwrap_or_default(),
+            messages: 0,
+            bytes: 0,
+            first: entry.data_time,
+            last: entry.data_time,
+        });
+        channel.messages += 1;
+        channel.bytes += entry.data.len() as u64;
+        channel.first = channel.first.min(entry.data_time);
+        channel.last = channel.last.max(entry.data_time);
+    }
+}
+
 impl RecordingInfo {
     /// Reads a recording and summarises its contents and its damage.
     ///
     /// # Errors
     /// [`RecordingError`] if it does not exist or is not an MCAP file.
     pub fn of(path: &Path) -> Result<Self, RecordingError> {
-        let mut channels: BTreeMap<String, ChannelInfo> = BTreeMap::new();
-        let mut health = BTreeMap::new();
-        let mut cameras = BTreeSet::new();
-        let mut newer = 0;
+        let mut messages = MessageSummary::default();
         let report = RecordingReader::open(path)?.for_each(|entry| {
-            if let Some(said) = LastHealth::read(&entry) {
-                health.insert(said.0, said.1);
-            }
-            let seen = glance(&entry.key.channel, &entry.data).ok().flatten();
-            newer += u64::from(seen.is_some_and(|seen| !seen.is_readable));
-            cameras.extend(entry.key.channel.camera().cloned());
-            let topic = entry.key.to_string();
-            let channel = channels.entry(topic.clone()).or_insert_with(|| ChannelInfo {
-                topic,
-                schema: schema_of(&entry.key.channel).unwrap_or_default(),
-                messages: 0,
-                bytes: 0,
-                first: entry.data_time,
-                last: entry.data_time,
-            });
-            channel.messages += 1;
-            channel.bytes += entry.data.len() as u64;
-            channel.first = channel.first.min(entry.data_time);
-            channel.last = channel.last.max(entry.data_time);
+            messages.add(&entry);
             Ok::<_, Infallible>(())
         });
         match report {
             Ok(report) => Ok(Self {
-                channels: channels.into_values().collect(),
-                cameras,
-                newer,
+                channels: messages.channels.into_values().collect(),
+                cameras: messages.cameras,
+                newer: messages.newer,
                 foreign: report.foreign,
                 source: report.source,
-                health,
+                health: messages.health,
                 damage: report.damage,
             }),
             Err(ReadFailure::Recording(error)) => Err(error),

@@ -17,7 +17,7 @@ use crate::{CHANNELS, Damage, Entry, RecordingError, Source};
 /// badly damaged file is given up sooner; with twice as much a hostile one takes twice as long.
 const MAX_READINGS: u64 = 16;
 
-/// Result of reading a recording: what it held, and what could not be read.
+/// Result of reading a recording: what it contained, and what could not be read.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ReadReport {
     /// Number of messages handed on.
@@ -170,7 +170,7 @@ impl<R: Read + Seek> RecordingReader<R> {
     }
 
     /// Continues after a record. Where its length is what is damaged, other chunks lie in the bytes
-    /// that it claims. A chunk that was read without error states its length once more inside,
+    /// that it states. A chunk that was read without error states its length once more inside,
     /// under its checksum.
     fn go_on(&mut self, opcode: u8, body: &[u8], mut next: u64, read: Result<(), String>) {
         if opcode == op::CHUNK && read.is_ok() {

@@ -224,7 +224,7 @@ fn a_file_that_is_no_mcap_is_named() {
     assert!(matches!(error, ReadFailure::Recording(RecordingError::NotMcap { .. })), "{error:?}");
 }
 
-/// A disk with room for so many bytes.
+/// A disk with room for a number of bytes.
 struct SmallDisk {
     bytes: Cursor<Vec<u8>>,
     room: u64,

@@ -112,12 +112,9 @@ impl SimulatedMount {
     pub fn at(&self, t: f64) -> MountState {
         let reach = (self.rate * (t - self.began_s)).max(0.0);
         // Each angle moves at the constant rate until it is there.
-        let on_the_way = |from: f64, to: f64| {
-            if (to - from).abs() <= reach { to } else { from + reach.copysign(to - from) }
-        };
         let said = ScanAngles {
-            azimuth: on_the_way(self.from.azimuth, self.to.azimuth),
-            elevation: on_the_way(self.from.elevation, self.to.elevation),
+            azimuth: moved_towards(self.to.azimuth, self.from.azimuth, reach),
+            elevation: moved_towards(self.to.elevation, self.from.elevation, reach),
         };
         let truth = ScanAngles {
             azimuth: said.azimuth + self.off[0],
@@ -125,6 +122,11 @@ impl SimulatedMount {
         };
         MountState { truth, said, settled: said == self.to }
     }
+}
+
+/// An angle after a turn towards another by at most `reach`.
+fn moved_towards(to: f64, from: f64, reach: f64) -> f64 {
+    if (to - from).abs() <= reach { to } else { from + reach.copysign(to - from) }
 }
 
 #[cfg(test)]

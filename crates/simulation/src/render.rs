@@ -1,11 +1,14 @@
 //! Drawing into an image: targets, dark silhouettes with soft edges that are smeared along their
 //! motion during the exposure; and clutter, strips and discs of one brightness.
 
+use std::ops::Range;
+
 /// Difference of brightness between the sky and a target, 8-bit levels. With half of it targets are
 /// no darker than clouds may be, 43 levels; twice as much is more than the darkest sky has.
 const DARKNESS: f32 = 85.0;
 /// Number of copies of a target that make up its motion blur. Three show separately where a target
-/// moves by more than three of its spans during the exposure; one would be no blur.
+/// moves by more than three of its spans during the exposure; one, as with half of it, would be no
+/// blur.
 const SMEAR_STEPS: usize = 3;
 /// Number of sub-samples per pixel and axis. With half of it a copy covers a pixel in steps of a
 /// quarter instead of a sixteenth, and small targets flicker as they move.
@@ -79,14 +82,16 @@ impl RenderedThing {
     }
 }
 
+/// The pixels of an axis with `side` of them that lie within a range.
+fn within([low, high]: [f64; 2], side: usize) -> Range<usize> {
+    (low.clamp(0.0, side as f64) as usize)..(high.clamp(0.0, side as f64) as usize)
+}
+
 impl Piece {
     /// Adds the share of each pixel that it covers.
     fn cover(&self, shares: &mut [f32], width: usize, soft: f64) {
         let height = shares.len() / width.max(1);
         let [columns, rows] = self.reach(soft);
-        let within = |[low, high]: [f64; 2], side: usize| {
-            (low.clamp(0.0, side as f64) as usize)..(high.clamp(0.0, side as f64) as usize)
-        };
         for y in within(rows, height) {
             for x in within(columns, width) {
                 shares[y * width + x] += self.share([x as f64, y as f64], soft) as f32;
@@ -97,16 +102,21 @@ impl Piece {
     /// The first and the last column, then row, that it may cover, the last one excluded.
     fn reach(&self, soft: f64) -> [[f64; 2]; 2] {
         let beyond = soft + 2.0;
-        [0, 1].map(|i| match *self {
+        [0, 1].map(|axis| self.reach_on(axis, beyond))
+    }
+
+    /// What it and `beyond` pixels about it cover of an axis, px.
+    fn reach_on(&self, axis: usize, beyond: f64) -> [f64; 2] {
+        match *self {
             Self::Strip { from, to, width } => {
                 let reach = width / 2.0 + beyond;
-                [from[i].min(to[i]) - reach, from[i].max(to[i]) + reach]
+                [from[axis].min(to[axis]) - reach, from[axis].max(to[axis]) + reach]
             }
             Self::Disc { centre, radius, edge } => {
                 let reach = radius + edge + beyond;
-                [centre[i] - reach, centre[i] + reach]
+                [centre[axis] - reach, centre[axis] + reach]
             }
-        })
+        }
     }
 
     /// The share of a pixel that it covers.
@@ -183,7 +193,8 @@ pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &Rend
 
 /// Share of a pixel that the smeared, blurred silhouette covers.
 fn cover(x: usize, y: usize, half: f64, soft: f64, target: &RenderedTarget) -> f64 {
-    // The blur as a 3x3 quadrature of the Gaussian: nodes at 0 and +-sqrt(3) sigma.
+    /// The blur as a 3x3 quadrature of the Gaussian: nodes at 0 and +-sqrt(3) sigma, each with its
+    /// weight. With half of the distance the blur would have a quarter of its variance.
     const NODES: [(f64, f64); 3] =
         [(-1.732_050_8, 1.0 / 6.0), (0.0, 2.0 / 3.0), (1.732_050_8, 1.0 / 6.0)];
     let mut sum = 0.0;

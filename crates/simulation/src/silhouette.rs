@@ -17,7 +17,7 @@ const MARGIN: f64 = 4.0;
 /// table's deviation.
 const FILL: f64 = 0.47;
 
-/// The sizes of Herasymenko 2021, Fig. 3 and Lytvynets 2020, Fig. 6.1.
+/// The sizes of Herasymenko 2021, Fig. 3 and Lytvynets 2020, Fig. 6.1, px: they are the papers'.
 pub const TEMPLATE_SIZES: [[usize; 2]; 4] = [[50, 30], [25, 15], [18, 12], [10, 6]];
 
 /// A silhouette as brightness above the background, from 0 to about 1.
@@ -200,22 +200,24 @@ fn filtered(samples: &[f32], columns: usize, kernel: &[f64]) -> Vec<f32> {
 /// Filters along lines of `count` samples that lie `stride` apart.
 fn filtered_along(samples: &[f32], stride: usize, count: usize, kernel: &[f64]) -> Vec<f32> {
     let sum: f64 = kernel.iter().sum();
+    let filtered = |i| (filtered_sample(samples, i, stride, count, kernel) / sum) as f32;
+    (0..samples.len()).map(filtered).collect()
+}
+
+/// The sum of a sample and its neighbours in the same line, weighted by the kernel.
+fn filtered_sample(samples: &[f32], i: usize, stride: usize, count: usize, kernel: &[f64]) -> f64 {
     let half = kernel.len() / 2;
-    (0..samples.len())
-        .map(|i| {
-            let at = i / stride % count;
-            let first = i - at * stride;
-            let mut value = 0.0;
-            for (k, tap) in kernel.iter().enumerate() {
-                // Tap k takes the sample k - half steps on, if that is in the same line.
-                let there = at + k;
-                if there >= half && there - half < count {
-                    value += tap * f64::from(samples[first + (there - half) * stride]);
-                }
-            }
-            (value / sum) as f32
-        })
-        .collect()
+    let at = i / stride % count;
+    let first = i - at * stride;
+    let mut value = 0.0;
+    for (k, tap) in kernel.iter().enumerate() {
+        // Tap k takes the sample k - half steps on, if that is in the same line.
+        let there = at + k;
+        if there >= half && there - half < count {
+            value += tap * f64::from(samples[first + (there - half) * stride]);
+        }
+    }
+    value
 }
 
 #[cfg(test)]

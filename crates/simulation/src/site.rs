@@ -75,7 +75,7 @@ pub struct Site {
     /// Probability that a target in the image is reported. Default 0.95.
     pub detection_probability: f64,
     /// Expected number of false bearings per exposure (Poisson), anywhere in the image. Default 1.
-    pub clutter: f64,
+    pub false_bearings: f64,
     /// Standard deviation of a bearing, rad per axis. Default 0.0005.
     pub noise_rad: f64,
 }
@@ -97,7 +97,7 @@ impl Default for Site {
             range_m: 2000.0,
             rate_hz: 30.0,
             detection_probability: 0.95,
-            clutter: 1.0,
+            false_bearings: 1.0,
             noise_rad: 5e-4,
         }
     }
@@ -114,6 +114,13 @@ pub struct SiteCamera {
     pub phase_s: f64,
 }
 
+impl SiteCamera {
+    /// Its calibration, exact.
+    fn calibration(&self) -> CameraCalibration {
+        CameraCalibration::new(&self.name, &self.camera, Timestamp::EPOCH).with_pose_sd(0.0, 0.0)
+    }
+}
+
 /// One exposure of one camera: the bearings that it reports at one time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SiteExposure {
@@ -123,7 +130,7 @@ pub struct SiteExposure {
     pub time_s: f64,
     /// The message.
     pub frame: BearingFrame,
-    /// For each bearing of the frame its target, and `None` for clutter: for scoring only.
+    /// For each bearing of the frame its target, and `None` for a false one: for scoring only.
     pub sources: Vec<Option<u64>>,
 }
 
@@ -182,7 +189,7 @@ impl Site {
             "from 0.01 to 1000 exposures a second",
         )?;
         check_range("detection_probability", self.detection_probability, 0.0..=1.0, "from 0 to 1")?;
-        check_range("clutter", self.clutter, 0.0..=1000.0, "from 0 to 1000 an exposure")?;
+        check_range("clutter", self.false_bearings, 0.0..=1000.0, "from 0 to 1000 an exposure")?;
         check_range("noise_rad", self.noise_rad, 1e-7..=0.1, "from 0.0000001 to 0.1 rad")
     }
 
@@ -256,10 +263,7 @@ impl SimulatedSite {
 
     /// The calibrations that a fusion centre needs, one per camera.
     pub fn calibrations(&self) -> Vec<CameraCalibration> {
-        let message = |c: &SiteCamera| {
-            CameraCalibration::new(&c.name, &c.camera, Timestamp::EPOCH).with_pose_sd(0.0, 0.0)
-        };
-        self.cameras.iter().map(message).collect()
+        self.cameras.iter().map(SiteCamera::calibration).collect()
     }
 
     /// The state of every target at a true time, s from the start; their ids are 0, 1 ...
@@ -298,9 +302,10 @@ impl SimulatedSite {
         // The lower streams belong to the targets' flights.
         rng.set_stream((1 << 32) + index);
         let mut bearings = self.detections(camera, time_s, &mut rng);
-        bearings
-            .extend(self.clutter(camera, &mut rng).into_iter().map(|direction| (direction, None)));
-        // Shuffled, so that clutter cannot be told from targets by its order.
+        bearings.extend(
+            self.false_directions(camera, &mut rng).into_iter().map(|direction| (direction, None)),
+        );
+        // Shuffled, so that false bearings cannot be distinguished from targets by their order.
         bearings.shuffle(&mut rng);
         let numbered = (sequence * NUMBERS_PER_EXPOSURE..).zip(&bearings);
         let tracks = numbered.map(|(number, (bearing, _))| self.track(number, camera, bearing));
@@ -345,11 +350,11 @@ impl SimulatedSite {
         found
     }
 
-    /// Clutter: random directions in the camera's frame.
-    fn clutter(&self, camera: &Camera, rng: &mut ChaCha8Rng) -> Vec<Unit<Vector3<f64>>> {
-        // For a mean of zero there is no Poisson distribution, and no clutter.
-        let count =
-            Poisson::new(self.description.clutter).map_or(0.0, |poisson| poisson.sample(rng));
+    /// False bearings: random directions in the camera's frame.
+    fn false_directions(&self, camera: &Camera, rng: &mut ChaCha8Rng) -> Vec<Unit<Vector3<f64>>> {
+        // For a mean of zero there is no Poisson distribution, and no false bearing.
+        let count = Poisson::new(self.description.false_bearings)
+            .map_or(0.0, |poisson| poisson.sample(rng));
         (0..count as u64).filter_map(|_| self.random_direction(camera, rng)).collect()
     }
 

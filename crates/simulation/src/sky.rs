@@ -3,15 +3,18 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Brightness at the lower (horizon) and the upper (zenith) edge of the image, 8-bit levels.
+/// Brightness at the lower (horizon) and the upper (zenith) edge of the image, 8-bit levels:
+/// between them clouds and targets fit above and below. With half of both, targets would be black.
 const GRADIENT: [f32; 2] = [190.0, 130.0];
 /// Amplitude of the coarsest clouds, 8-bit levels; each finer octave has half of it. All octaves
 /// together reach 43; with twice as much clouds could be as dark as targets, with half of it they
-/// are easily told from them.
+/// are easily distinguished from them.
 const CLOUDS: f32 = 22.0;
-/// Size of the coarsest clouds, pixels, and number of octaves: the finest are of 10 pixels, as
-/// small as targets. With half of the octaves none is smaller than 40.
+/// Size of the coarsest clouds, pixels. With half of it no cloud is as large as a quarter of a
+/// picture of 640x480.
 const COARSEST: usize = 160;
+/// Number of octaves of clouds: the finest are of 10 pixels, as small as targets. With half of it
+/// none is smaller than 40.
 const OCTAVES: u32 = 5;
 
 /// Period of a panorama's clouds in knots, in every octave: after this many the clouds repeat. With
@@ -89,14 +92,17 @@ impl Panorama {
                 let place =
                     |from: i64, offset: usize| (from + offset as i64).rem_euclid(around) as usize;
                 let (x, y) = (place(left, index % width), place(top, index / width));
-                let corner = |dx: usize, dy: usize| {
-                    knots[(y / cell + dy) % PERIOD * PERIOD + (x / cell + dx) % PERIOD]
-                };
+                let corner = |dx, dy| periodic_knot(knots, x / cell + dx, y / cell + dy);
                 *sample += strength * between(corner, [x % cell, y % cell], cell);
             }
         }
         samples
     }
+}
+
+/// The knot of a panorama's octave in a column and a row, which repeat.
+fn periodic_knot(knots: &[f32], column: usize, row: usize) -> f32 {
+    knots[row % PERIOD * PERIOD + column % PERIOD]
 }
 
 #[cfg(test)]

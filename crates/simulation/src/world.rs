@@ -145,8 +145,8 @@ impl SimulatedCamera {
         self.description.phase_s + index as f64 / self.description.rate_hz
     }
 
-    /// Renders a frame: sky, clutter, targets smeared by their motion, lens blur, noise. A camera on a
-    /// mount is at rest.
+    /// Renders a frame: sky, clutter, targets smeared by their motion, lens blur, noise. A camera
+    /// on a mount is at rest.
     pub fn frame(&self, index: u64) -> RenderedFrame {
         self.render(index, &self.camera, self.sky.clone())
     }
@@ -192,8 +192,8 @@ impl SimulatedCamera {
         RenderedFrame { index, true_s, own_s, width, height, brightness }
     }
 
-    /// All that is before the camera at a time, the farthest first: clutter hides what is behind it,
-    /// a target darkens it.
+    /// All that is before the camera at a time, the farthest first: clutter hides what is behind
+    /// it, a target darkens it.
     fn in_view(&self, camera: &Camera, t: f64) -> Vec<InView> {
         let mut things: Vec<(f64, InView)> = Vec::new();
         for target in &self.targets {

@@ -67,7 +67,7 @@ mod spots;
 pub use identify::NamedStar;
 pub use observer::{Observer, Turn, star_sd_rad};
 pub use sky::{Sky, Star};
-pub use spots::{Picture, Spot, find_spots};
+pub use spots::{Spot, StarPicture, find_spots};
 
 use thiserror::Error;
 
@@ -98,8 +98,8 @@ pub enum StarError {
     },
     /// No part of the sky looks like the picture.
     #[error(
-        "none of the {spots} spots in the picture could be named: is the lens (file, resolution, zoom) that \
-         of the picture, and is it of the night sky?"
+        "none of the {spots} spots in the picture could be named: is the lens (file, resolution, \
+         zoom) that of the picture, and is it of the night sky?"
     )]
     Unknown {
         /// How many spots there were.
@@ -110,8 +110,8 @@ pub enum StarError {
     Mirrored,
     /// The named stars are below the horizon.
     #[error(
-        "the stars of the picture stand under the horizon at the given time and place: is the time UTC, \
-         and the longitude east?"
+        "the stars of the picture stand under the horizon at the given time and place: is the \
+         time UTC, and the longitude east?"
     )]
     UnderHorizon,
 }

@@ -10,32 +10,40 @@ use crate::StarError;
 
 /// Julian date of the Unix epoch: 1970-01-01, 0 h.
 const UNIX_EPOCH_JD: f64 = 2_440_587.5;
+/// Length of a day, s.
 const DAY_S: f64 = 86_400.0;
-/// Julian date of J2000.0, and days of a Julian year, in which proper motions are counted.
+/// Julian date of J2000.0, from which proper motions are counted.
 const J2000_JD: f64 = 2_451_545.0;
+/// Days of a Julian year, in which proper motions are counted.
 const JULIAN_YEAR_D: f64 = 365.25;
 
-/// Pressure at sea level (hPa), and the height over which it falls to 1/e (m): the standard
-/// atmosphere.
+/// Pressure at sea level in the standard atmosphere, hPa. With half of it refraction would be half
+/// as large.
 const SEA_LEVEL_HPA: f64 = 1013.25;
+/// Height over which the pressure falls to 1/e in the standard atmosphere, m. With half of it
+/// refraction at 1000 m would be 11 % too small.
 const SCALE_HEIGHT_M: f64 = 8434.0;
-/// Temperature of a cool night, degrees Celsius; ten degrees more reduce refraction by 3.5 %.
+/// Temperature of a cool night, degrees Celsius; ten degrees more reduce refraction by 3.5 %, five
+/// less add 1.8 %.
 const TEMPERATURE_C: f64 = 10.0;
-/// Relative humidity and wavelength (micrometres, the middle of what cameras see): both change
-/// refraction by less than 1 %.
+/// Relative humidity. With half of it refraction changes by less than 1 %.
 const HUMIDITY: f64 = 0.5;
+/// Wavelength, micrometres: the middle of what cameras see. From there to the ends of that range
+/// refraction changes by less than 1 %.
 const WAVELENGTH_UM: f64 = 0.6;
 /// Relative standard deviation of refraction, as the weather is not known: 15 degrees of
 /// temperature and 20 hPa, each a standard deviation. With half of it low stars weigh up to four
 /// times as much, and the weather tilts cameras by more than they state.
 const REFRACTION_SHARE: f64 = 0.05;
 
-/// UT1, by which the Earth turns, was within 0.3 s of UTC in these years, ...
+/// Years in which UT1, by which the Earth turns, was within 0.3 s of UTC. The difference on a given
+/// day is in no file here.
 const QUIET_YEARS: std::ops::Range<f64> = 2017.0..2028.0;
+/// Standard deviation of UT1 against UTC in these years, s. With half of it their bound is four
+/// deviations, and cameras may be turned by more than they state.
 const QUIET_EARTH_SD_S: f64 = 0.15;
-/// ... and is kept within 0.9 s of it. The difference on a given day is in no file here. Standard
-/// deviations, s. With half of them these bounds are four deviations and more, and cameras may be
-/// turned by more than they state.
+/// The same in other years, s: UT1 is kept within 0.9 s of UTC. With half of it that bound is more
+/// than four deviations.
 const EARTH_SD_S: f64 = 0.4;
 /// The Earth's rate against the stars, rad/s.
 const EARTH_RATE: f64 = 7.292_115e-5;

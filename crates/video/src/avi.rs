@@ -2,12 +2,12 @@ use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
-use crate::{CaptureTime, Frame, FrameClock, FrameSource, VideoError, decode_still};
+use crate::{CaptureTime, Frame, FrameClock, FrameSource, Still, VideoError, decode_still};
 
 /// The longest frame that is read, bytes: no JPEG picture of the largest image is longer. With half
 /// of it the same for pictures of cameras.
 const MOST_BYTES: u64 = 1 << 28;
-/// Codecs in which every frame is a JPEG picture.
+/// Codecs in which every frame is a JPEG picture, as files name them.
 const MOTION_JPEG: [&[u8; 4]; 4] = [b"MJPG", b"mjpg", b"AVI1", b"JPEG"];
 
 /// An AVI file with Motion JPEG; its first video stream is read.
@@ -164,7 +164,7 @@ impl FrameSource for AviSource {
             if bytes.is_empty() {
                 return Err(frame("it was left out by the recorder".to_owned()));
             }
-            let (width, height, pixels) = decode_still(&bytes).map_err(frame)?;
+            let Still { width, height, pixels } = decode_still(&bytes).map_err(frame)?;
             let CaptureTime { time, sd_s } = self.clock.at(index as f64 / self.rate_hz);
             return Ok(Some(Frame {
                 index,

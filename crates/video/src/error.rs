@@ -16,7 +16,8 @@ pub enum VideoError {
     },
     /// Neither a folder of images nor a file of a known kind.
     #[error(
-        "{} is neither a folder of PNG or JPEG images nor a .mp4, .avi or .y4m file (`ffmpeg -i IN -c:v libx264 -pix_fmt yuv420p OUT.mp4` makes most videos readable)",
+        "{} is neither a folder of PNG or JPEG images nor a .mp4, .avi or .y4m file (`ffmpeg -i IN \
+         -c:v libx264 -pix_fmt yuv420p OUT.mp4` makes most videos readable)",
         path.display()
     )]
     UnknownKind {
@@ -31,7 +32,8 @@ pub enum VideoError {
     },
     /// The file as a whole cannot be read.
     #[error(
-        "{} cannot be read: {what} (`ffmpeg -i IN -c:v libx264 -pix_fmt yuv420p OUT.mp4` makes most videos readable)",
+        "{} cannot be read: {what} (`ffmpeg -i IN -c:v libx264 -pix_fmt yuv420p OUT.mp4` makes \
+         most videos readable)",
         path.display()
     )]
     Damaged {

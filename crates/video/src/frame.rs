@@ -2,9 +2,10 @@ use std::time::Instant;
 
 use crossfix_message::Timestamp;
 
-/// Weights of red, green and blue in brightness (BT.601).
+/// Weights of red, green and blue in brightness (BT.601). They sum to 1: with half of them colour
+/// video would be half as bright as grey.
 const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
-/// Converts 16-bit levels to 8-bit levels.
+/// Converts 16-bit levels to 8-bit levels: 65535 becomes 255. With half of it white would be grey.
 const SIXTEEN_TO_EIGHT: f32 = 1.0 / 257.0;
 
 /// When a frame was captured: mid-exposure.
@@ -80,10 +81,9 @@ pub struct Frame {
 }
 
 fn weighted<T: Copy>(samples: &[T], scale: f32, as_f32: impl Fn(T) -> f32) -> Vec<f32> {
-    let brightness = |p: &[T]| {
-        (LUMA[0] * as_f32(p[0]) + LUMA[1] * as_f32(p[1]) + LUMA[2] * as_f32(p[2])) * scale
-    };
-    samples.chunks_exact(3).map(brightness).collect()
+    let luma = |[r, g, b]: [f32; 3]| LUMA[0] * r + LUMA[1] * g + LUMA[2] * b;
+    let pixels = samples.chunks_exact(3).map(|p| [as_f32(p[0]), as_f32(p[1]), as_f32(p[2])]);
+    pixels.map(|pixel| luma(pixel) * scale).collect()
 }
 
 impl Frame {

@@ -12,7 +12,7 @@ use openh264::encoder::{
 use openh264::formats::{YUVSlices, YUVSource};
 
 use crate::annex_b::units;
-use crate::{MOST_PIXELS, Pixels};
+use crate::{MOST_PIXELS, Pixels, Still};
 
 /// Most units whose pictures are waited for: no decoder holds back more, H.264 allows 16. With half
 /// of it every picture of a stream that holds back 16 would have its successor's time.
@@ -20,7 +20,7 @@ const MOST_PENDING: usize = 32;
 
 /// The brightness of a decoded picture, row by row.
 #[derive(Debug)]
-pub(crate) struct Picture {
+pub(crate) struct DecodedPicture {
     /// When it is to be shown, in the time units of its source.
     pub(crate) shown_at: i64,
     pub(crate) width: usize,
@@ -28,17 +28,18 @@ pub(crate) struct Picture {
     pub(crate) brightness: Vec<u8>,
 }
 
-impl Picture {
-    /// Its time, size and pixels.
-    pub(crate) fn into_parts(self) -> (i64, usize, usize, Pixels) {
-        (self.shown_at, self.width, self.height, Pixels::Gray8(self.brightness))
+impl DecodedPicture {
+    /// It without its time.
+    pub(crate) fn into_still(self) -> Still {
+        let Self { width, height, brightness, .. } = self;
+        Still { width, height, pixels: Pixels::Gray8(brightness) }
     }
 }
 
 /// Decodes H.264 to brightness, every picture with its own time.
 ///
 /// A decoder may hold pictures back until it is sure that none is to be shown before them, and in
-/// most profiles it is never sure. A live stream is taken to be in display order until it says
+/// most profiles it is never sure. A live stream is assumed to be in display order until it says
 /// otherwise or shows a picture that builds on later ones (a B slice); until then each picture
 /// comes out at once, with the time of its own unit.
 pub(crate) struct H264Decoder {
@@ -70,7 +71,11 @@ impl H264Decoder {
     }
 
     /// Decodes an access unit in Annex B; `None` if its picture comes out later.
-    pub(crate) fn decode(&mut self, unit: &[u8], shown_at: i64) -> Result<Option<Picture>, String> {
+    pub(crate) fn decode(
+        &mut self,
+        unit: &[u8],
+        shown_at: i64,
+    ) -> Result<Option<DecodedPicture>, String> {
         self.pending.push(Reverse(shown_at));
         if self.pending.len() > MOST_PENDING {
             // Some units have no picture: nothing will come out for the oldest.
@@ -99,7 +104,7 @@ impl H264Decoder {
     }
 
     /// The pictures that the decoder still holds back.
-    pub(crate) fn finish(&mut self) -> Result<Vec<Result<Picture, String>>, String> {
+    pub(crate) fn finish(&mut self) -> Result<Vec<Result<DecodedPicture, String>>, String> {
         let pictures = self.decoder.flush_remaining().map_err(|error| in_words(&error))?;
         let picture = |picture| picture_of(&picture, self.pending.pop());
         Ok(pictures.into_iter().map(picture).collect())
@@ -156,7 +161,8 @@ fn exp_golomb(bits: &mut impl Iterator<Item = u8>) -> u64 {
 }
 
 /// Quantisation parameter, on H.264's scale of 0 to 51: that of a good camera. From 30 on faint
-/// targets are lost in blocks.
+/// targets are lost in blocks; with half of it pictures are quantised four times as finely, and are
+/// that much longer.
 const COARSENESS: u8 = 24;
 
 /// Encodes brightness as H.264, with a key picture once a second.
@@ -259,7 +265,10 @@ fn in_words(error: &openh264::Error) -> String {
     format!("it is damaged, or builds on one that is{number}")
 }
 
-fn picture_of(picture: &DecodedYUV<'_>, time: Option<Reverse<i64>>) -> Result<Picture, String> {
+fn picture_of(
+    picture: &DecodedYUV<'_>,
+    time: Option<Reverse<i64>>,
+) -> Result<DecodedPicture, String> {
     let (width, height) = picture.dimensions();
     let (stride, _, _) = picture.strides();
     if width == 0 || height == 0 || (width * height) as u64 > MOST_PIXELS || stride < width {
@@ -273,7 +282,7 @@ fn picture_of(picture: &DecodedYUV<'_>, time: Option<Reverse<i64>>) -> Result<Pi
         return Err("its brightness plane is cut off".to_owned());
     }
     let Reverse(shown_at) = time.ok_or("it has no time")?;
-    Ok(Picture { shown_at, width, height, brightness })
+    Ok(DecodedPicture { shown_at, width, height, brightness })
 }
 
 #[cfg(test)]

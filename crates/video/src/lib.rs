@@ -74,7 +74,7 @@ pub use rtsp::{
     StreamAddress, StreamLatency,
 };
 pub use sequence::SequenceSource;
-pub use still::decode_still;
+pub use still::{Still, decode_still};
 pub use usb::{UsbCamera, UsbOptions, usb_cameras};
 pub use y4m_file::Y4mSource;
 
@@ -110,7 +110,7 @@ pub struct Losses {
     pub packets_lost: u64,
     /// Packets that came when they were requested again.
     pub packets_recovered: u64,
-    /// Frames that arrived but were discarded, as they were not taken in time.
+    /// Frames that arrived but were discarded, as they were not fetched in time.
     pub frames_left_out: u64,
 }
 

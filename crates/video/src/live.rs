@@ -12,10 +12,11 @@ pub(crate) const SILENCE: Duration = Duration::from_secs(2);
 /// here. With half of it those that send one in 16 s or more are reopened for ever.
 const LONGEST_SILENCE: Duration = Duration::from_secs(32);
 /// Pause before a camera is reopened for the first time; each pause is twice the one before, up to
-/// the longest. A camera that restarts takes half a minute, and should not be asked all the time.
-/// With twice the longest, a camera that is back stays unseen for up to 16 s; with half of it, one
-/// that is gone is asked twice as often.
+/// the longest. With half of it one that is restarting is asked once more.
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
+/// Longest pause before a camera is reopened: one that restarts takes half a minute, and should not
+/// be asked all the time. With twice as much a camera that is back stays unseen for up to 16 s;
+/// with half of it one that is gone is asked twice as often.
 const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 /// A camera that broke off after less than this is not steady: its pauses go on growing as if it
 /// had never been there. With half of it one that breaks off every three seconds is asked again
@@ -29,12 +30,12 @@ const REFUSED_PAUSE: Duration = Duration::from_secs(60);
 /// between two frames, and the farewell. With half of it a farewell that takes its full 200 ms
 /// leaves no time for the frame, and a session may stay open in the camera.
 const LEAVE: Duration = Duration::from_millis(400);
-/// Frames that may wait to be taken; if there are more, the oldest is discarded. One that has
+/// Frames that may wait to be fetched; if there are more, the oldest is discarded. One that has
 /// waited longer is of no use for where something is now. With half of it a program that stops for
 /// three frames loses one; with twice as much frames may be a quarter of a second old at 30 Hz.
 const WAITING: usize = 4;
-/// Troubles that may wait to be taken. With half of it the same: what comes beyond is dropped, and
-/// the first ones say why.
+/// Troubles that may wait to be fetched. With half of it the same: what comes beyond is dropped,
+/// and the first ones say why.
 const TROUBLES: usize = 64;
 
 /// What a live camera shows at the moment.
@@ -195,8 +196,7 @@ impl Drop for Live {
         let mut state = self.shared.locked();
         state.ended = true;
         self.shared.changed.notify_all();
-        // If the camera is not told that nobody watches any more, it may have no room for the next
-        // client.
+        // If the session is not closed, the camera may have no room for the next client.
         let until = Instant::now() + LEAVE;
         while !state.left {
             let left = until.saturating_duration_since(Instant::now());
@@ -255,12 +255,12 @@ fn watch(
     first: u64,
     frames: &mut u64,
 ) -> Result<(), VideoError> {
-    let mut told = Losses::default();
+    let mut counted = Losses::default();
     while !shared.ended() {
         let next = source.next_frame();
         let losses = source.losses();
-        shared.locked().counts.add(losses, told);
-        told = losses;
+        shared.locked().counts.add(losses, counted);
+        counted = losses;
         match next {
             Ok(Some(frame)) => {
                 *frames = frame.index + 1;

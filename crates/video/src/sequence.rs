@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use crate::{Frame, FrameClock, FrameSource, VideoError, decode_still};
+use crate::{Frame, FrameClock, FrameSource, Still, VideoError, decode_still};
 
 /// A folder of PNG or JPEG images in the order of their names, with numbers in names compared as
 /// numbers.
@@ -59,7 +59,7 @@ impl FrameSource for SequenceSource {
         self.next += 1;
         let frame = |what| VideoError::Frame { path: path.clone(), index, what };
         let bytes = std::fs::read(path).map_err(|error| frame(error.to_string()))?;
-        let (width, height, pixels) = decode_still(&bytes).map_err(frame)?;
+        let Still { width, height, pixels } = decode_still(&bytes).map_err(frame)?;
         let capture = self.clock.at(index as f64 / self.clock.fallback_rate_hz);
         Ok(Some(Frame { index, capture, live: None, width, height, pixels }))
     }

@@ -7,8 +7,16 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 
 use crate::{MOST_PIXELS, Pixels};
 
-/// Columns, rows and samples of a still image.
-pub type Still = (usize, usize, Pixels);
+/// A still image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Still {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// `width * height` pixels.
+    pub pixels: Pixels,
+}
 
 /// Decodes a PNG or JPEG image from its bytes; transparency is dropped.
 ///
@@ -60,7 +68,7 @@ fn decode_png(bytes: &[u8]) -> Result<Still, String> {
         let samples = drop_alpha(&buffer, channels, kept);
         if kept == 1 { Pixels::Gray8(samples) } else { Pixels::Rgb8(samples) }
     };
-    Ok((width as usize, height as usize, pixels))
+    Ok(Still { width: width as usize, height: height as usize, pixels })
 }
 
 fn decode_jpeg(bytes: &[u8]) -> Result<Still, String> {
@@ -74,5 +82,5 @@ fn decode_jpeg(bytes: &[u8]) -> Result<Still, String> {
     decoder.set_options(options.jpeg_set_out_colorspace(wanted));
     let samples = decoder.decode().map_err(|error| error.to_string())?;
     let pixels = if gray { Pixels::Gray8(samples) } else { Pixels::Rgb8(samples) };
-    Ok((usize::from(info.width), usize::from(info.height), pixels))
+    Ok(Still { width: usize::from(info.width), height: usize::from(info.height), pixels })
 }

@@ -8,7 +8,8 @@ use crossfix_message::Timestamp;
 
 use crate::{CaptureTime, StreamLatency, TimedBy};
 
-/// Seconds from the start of NTP's count, in 1900, to that of Unix's, in 1970.
+/// Seconds from the start of NTP's count, in 1900, to that of Unix's, in 1970: 70 years with 17
+/// leap days. Another number would be another date.
 pub(crate) const NTP_TO_UNIX_S: u64 = 2_208_988_800;
 /// How long a sender report is used to estimate the camera's clock, s. Reports come every five
 /// seconds or so and each may be some milliseconds off; over a minute a quartz clock's drift is a
@@ -27,12 +28,13 @@ pub(crate) const SET_S: f64 = 0.25;
 /// network that stalls holds frames for as long; half of it would refuse cameras on bad networks.
 const FARTHEST_S: f64 = 2.0;
 /// Reports that span less than this are averaged, not fitted by a sloping line, s: the slope would
-/// follow their errors of some milliseconds, as cameras report when they get round to it.
+/// follow their errors of some milliseconds, as cameras report when they get round to it. With half
+/// of it the slope by such reports errs by twice as much.
 const LEVEL_S: f64 = REPORTS_S / 5.0;
 /// The same for a camera's answers to a question, which are good to a tenth of a millisecond, s:
 /// with half of it the line would err by as much as the fastest quartz gains.
 const ASKED_LEVEL_S: f64 = 2.0;
-/// The quickest arrival within this time is taken for one that nothing delayed, s. A quartz drifts
+/// The quickest arrival within this time counts as one that nothing delayed, s. A quartz drifts
 /// by a millisecond in it; with half of it, a stall of some seconds would be attributed to the
 /// camera.
 const ARRIVALS_S: f64 = 30.0;
@@ -49,52 +51,62 @@ const REMEMBERED_SD_S: f64 = 0.1;
 /// A camera's clock, estimated from its latest reports.
 #[derive(Clone, Debug)]
 struct Reports {
-    /// Stream time, s, and how far the camera's clock was then ahead of the first report's line, s.
-    /// That line has slope 1: it advances as the stream's count does.
-    told: VecDeque<(f64, f64)>,
+    latest: VecDeque<ClockReading>,
     /// The clock's time at the stream's time 0, by the first report.
     zero: Option<Timestamp>,
-    /// While the reports span less than this, s, the clock is taken to run as the stream's count
+    /// While the reports span less than this, s, the clock is assumed to run as the stream's count
     /// does.
     level_s: f64,
 }
 
+/// One report of a camera's clock.
+#[derive(Clone, Copy, Debug)]
+struct ClockReading {
+    /// Stream time, s.
+    stream_s: f64,
+    /// How far the camera's clock was then ahead of the first report's line, s. That line has slope
+    /// 1: it advances as the stream's count does.
+    beyond_s: f64,
+}
+
 impl Reports {
     fn new(level_s: f64) -> Self {
-        Self { told: VecDeque::new(), zero: None, level_s }
+        Self { latest: VecDeque::new(), zero: None, level_s }
     }
 
     /// Adds a report; where it shows that the clock was set, the earlier ones are discarded.
-    fn add(&mut self, stream_s: f64, told: Timestamp) {
-        let zero = *self.zero.get_or_insert(told.plus_seconds(-stream_s));
-        // beyond = told - (zero + stream_s)
-        let beyond = told.seconds_since(zero.plus_seconds(stream_s));
-        let was_set = !self.told.is_empty() && (beyond - self.beyond(stream_s)).abs() > SET_S;
+    fn add(&mut self, stream_s: f64, shown: Timestamp) {
+        let zero = *self.zero.get_or_insert(shown.plus_seconds(-stream_s));
+        // beyond = shown - (zero + stream_s)
+        let beyond_s = shown.seconds_since(zero.plus_seconds(stream_s));
+        let was_set = !self.latest.is_empty() && (beyond_s - self.beyond(stream_s)).abs() > SET_S;
         if was_set {
-            self.told.clear();
-            self.zero = Some(told.plus_seconds(-stream_s));
+            self.latest.clear();
+            self.zero = Some(shown.plus_seconds(-stream_s));
         }
-        self.told.push_back((stream_s, if was_set { 0.0 } else { beyond }));
-        while self.told.len() > MOST_REPORTS
-            || self.told.front().is_some_and(|(first, _)| stream_s - first > REPORTS_S)
+        let beyond_s = if was_set { 0.0 } else { beyond_s };
+        self.latest.push_back(ClockReading { stream_s, beyond_s });
+        while self.latest.len() > MOST_REPORTS
+            || self.latest.front().is_some_and(|first| stream_s - first.stream_s > REPORTS_S)
         {
-            self.told.pop_front();
+            self.latest.pop_front();
         }
     }
 
     /// How far the clock is ahead of the first report's line at a stream time, s: the least-squares
     /// line through the reports, or their mean while they span too little.
     fn beyond(&self, stream_s: f64) -> f64 {
-        let n = self.told.len().max(1) as f64;
-        let mean = |of: fn(&(f64, f64)) -> f64| self.told.iter().map(of).sum::<f64>() / n;
-        let (mid, level) = (mean(|(s, _)| *s), mean(|(_, beyond)| *beyond));
-        let spread: f64 = self.told.iter().map(|(s, _)| (s - mid).powi(2)).sum();
-        let span = self.told.back().map_or(0.0, |(last, _)| last - self.told[0].0);
+        let n = self.latest.len().max(1) as f64;
+        let mean = |of: fn(&ClockReading) -> f64| self.latest.iter().map(of).sum::<f64>() / n;
+        let (mid, level) = (mean(|r| r.stream_s), mean(|r| r.beyond_s));
+        let spread: f64 = self.latest.iter().map(|r| (r.stream_s - mid).powi(2)).sum();
+        let span = self.latest.back().map_or(0.0, |last| last.stream_s - self.latest[0].stream_s);
         if span < self.level_s || spread == 0.0 {
             return level;
         }
         // slope = sum (s - mid) (b - level) / sum (s - mid)^2
-        let slope = self.told.iter().map(|(s, b)| (s - mid) * (b - level)).sum::<f64>() / spread;
+        let products = self.latest.iter().map(|r| (r.stream_s - mid) * (r.beyond_s - level));
+        let slope = products.sum::<f64>() / spread;
         level + slope * (stream_s - mid)
     }
 
@@ -106,28 +118,36 @@ impl Reports {
 
 /// The quickest recent arrivals.
 #[derive(Clone, Debug, Default)]
-struct Arrivals {
-    /// Arrival time and delay relative to the stream time, s. Each entry is quicker than all after
-    /// it, so the first is the quickest.
-    quickest: VecDeque<(f64, f64)>,
+struct QuickestArrivals {
+    /// Each is quicker than all after it, so the first is the quickest.
+    quickest: VecDeque<TimedArrival>,
 }
 
-impl Arrivals {
+/// When a frame arrived.
+#[derive(Clone, Copy, Debug)]
+struct TimedArrival {
+    /// Time of arrival, s.
+    at_s: f64,
+    /// That less the stream time, s.
+    late_s: f64,
+}
+
+impl QuickestArrivals {
     fn add(&mut self, stream_s: f64, arrived_s: f64) {
         // Drops entries that this arrival beats: they can never be the quickest again.
-        let late = arrived_s - stream_s;
-        while self.quickest.back().is_some_and(|(_, other)| *other >= late) {
+        let late_s = arrived_s - stream_s;
+        while self.quickest.back().is_some_and(|other| other.late_s >= late_s) {
             self.quickest.pop_back();
         }
-        self.quickest.push_back((arrived_s, late));
-        while self.quickest.front().is_some_and(|(at, _)| arrived_s - at > ARRIVALS_S) {
+        self.quickest.push_back(TimedArrival { at_s: arrived_s, late_s });
+        while self.quickest.front().is_some_and(|first| arrived_s - first.at_s > ARRIVALS_S) {
             self.quickest.pop_front();
         }
     }
 
     /// When a frame of that stream time would have arrived if nothing had delayed it, s.
     fn unhindered_s(&self, stream_s: f64) -> Option<f64> {
-        self.quickest.front().map(|(_, late)| stream_s + late)
+        self.quickest.front().map(|first| stream_s + first.late_s)
     }
 }
 
@@ -182,12 +202,12 @@ impl ClockMemory {
 
     /// The offset found last, s, if it is not too old and the host's clock has not been set since.
     fn ahead_s(&self, now: Timestamp, host: &HostClock) -> Option<f64> {
-        self.locked().filter(|ahead| ahead.holds(now, host)).map(|ahead| ahead.by_s)
+        self.locked().filter(|ahead| ahead.is_valid(now, host)).map(|ahead| ahead.by_s)
     }
 }
 
 impl Ahead {
-    fn holds(&self, now: Timestamp, host: &HostClock) -> bool {
+    fn is_valid(&self, now: Timestamp, host: &HostClock) -> bool {
         now.seconds_since(self.at).abs() <= REMEMBERED_S && self.host.set_by_s(host).abs() <= SET_S
     }
 }
@@ -203,10 +223,16 @@ pub(crate) struct StreamClock {
     latency: StreamLatency,
     heeds_reports: bool,
     reports: Reports,
-    arrivals: Arrivals,
+    arrivals: QuickestArrivals,
     memory: ClockMemory,
-    /// Stream time and arrival of the last frame, s.
-    last: Option<(f64, f64)>,
+    last: Option<LastFrame>,
+}
+
+/// The times of the last frame, s.
+#[derive(Clone, Copy, Debug)]
+struct LastFrame {
+    stream_s: f64,
+    arrived_s: f64,
 }
 
 impl StreamClock {
@@ -217,7 +243,7 @@ impl StreamClock {
         heeds_reports: bool,
         memory: ClockMemory,
     ) -> Self {
-        let (reports, arrivals) = (Reports::new(LEVEL_S), Arrivals::default());
+        let (reports, arrivals) = (Reports::new(LEVEL_S), QuickestArrivals::default());
         Self { host, latency, heeds_reports, reports, arrivals, memory, last: None }
     }
 
@@ -227,24 +253,23 @@ impl StreamClock {
         Self { reports, ..Self::new(host, latency, true, ClockMemory::default()) }
     }
 
-    /// The camera says that its clock showed `told` at a stream time.
-    pub(crate) fn report(&mut self, stream_s: f64, told: Timestamp) {
+    /// The camera says what its clock has `shown` at a stream time.
+    pub(crate) fn report(&mut self, stream_s: f64, shown: Timestamp) {
         if self.heeds_reports {
-            self.reports.add(stream_s, told);
+            self.reports.add(stream_s, shown);
         }
     }
 
     /// Capture time of a frame with a stream time, which arrived `arrived_s` after the host's clock
     /// was read, and whose clock it is by.
     pub(crate) fn time(&mut self, stream_s: f64, arrived_s: f64) -> (CaptureTime, TimedBy) {
-        if let Some((stream_before_s, arrived_before_s)) = self.last.replace((stream_s, arrived_s))
-        {
-            let passed_s = stream_s - stream_before_s;
+        if let Some(before) = self.last.replace(LastFrame { stream_s, arrived_s }) {
+            let passed_s = stream_s - before.stream_s;
             // The stream's count started again from another instant: it went back, or ahead of the
             // arrivals. The reverse is no sign of that: a network may delay a frame by any time.
-            if passed_s < 0.0 || passed_s - (arrived_s - arrived_before_s) > FARTHEST_S {
+            if passed_s < 0.0 || passed_s - (arrived_s - before.arrived_s) > FARTHEST_S {
                 self.reports = Reports::new(self.reports.level_s);
-                self.arrivals = Arrivals::default();
+                self.arrivals = QuickestArrivals::default();
             }
         }
         self.arrivals.add(stream_s, arrived_s);
@@ -436,11 +461,11 @@ mod tests {
     #[test]
     fn whatever_a_camera_says_times_are_times() {
         let strange = [0.0, -1e18, 1e18, f64::NAN, f64::INFINITY];
-        for told in [Timestamp::EPOCH, Timestamp::MIN, Timestamp::from_nanos(i64::MAX)] {
+        for shown in [Timestamp::EPOCH, Timestamp::MIN, Timestamp::from_nanos(i64::MAX)] {
             for stream_s in strange {
                 let mut clock = clock(&ClockMemory::default());
-                clock.report(stream_s, told);
-                clock.report(1.0, told);
+                clock.report(stream_s, shown);
+                clock.report(1.0, shown);
                 let (found, _) = clock.time(stream_s, 0.1);
                 assert!(found.sd_s.is_finite());
             }

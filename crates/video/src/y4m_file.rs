@@ -9,15 +9,15 @@ use crate::{Frame, FrameClock, FrameSource, MOST_PIXELS, Pixels, VideoError};
 /// The longest header line that is read, bytes. With half of it the same.
 const MOST_HEADER: u64 = 4096;
 
-type Input = Chain<Cursor<Vec<u8>>, Counted>;
+type Input = Chain<Cursor<Vec<u8>>, CountingFile>;
 
 /// A file that counts how many bytes have been read since the count was reset.
-struct Counted {
+struct CountingFile {
     file: BufReader<File>,
     read: Arc<AtomicU64>,
 }
 
-impl Read for Counted {
+impl Read for CountingFile {
     fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
         let got = self.file.read(buffer)?;
         self.read.fetch_add(got as u64, Ordering::Relaxed);
@@ -61,7 +61,7 @@ impl Y4mSource {
         let sixteen = text.contains("Cmono16");
         let header = text.replace("Cmono16", "Cmono12").into_bytes();
         let read = Arc::new(AtomicU64::new(0));
-        let counted = Counted { file, read: Arc::clone(&read) };
+        let counted = CountingFile { file, read: Arc::clone(&read) };
         let limits = y4m::Limits { bytes: 8 * MOST_PIXELS as usize };
         let decoder = y4m::Decoder::new_with_limits(Cursor::new(header).chain(counted), limits)
             .map_err(|error| damaged(error.to_string()))?;
@@ -85,7 +85,7 @@ impl Y4mSource {
     }
 }
 
-/// The picture's width or height by its letter in the header; 0 where that does not tell it.
+/// The picture's width or height by its letter in the header; 0 where that does not say.
 fn side(header: &str, letter: char) -> u64 {
     let mut tokens = header.split_whitespace().filter_map(|token| token.strip_prefix(letter));
     // The library takes the last of several values, whatever it is, so exactly one is allowed.

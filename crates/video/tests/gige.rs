@@ -209,7 +209,8 @@ fn a_camera_that_somebody_else_controls_or_that_is_not_there_is_said() {
     assert!(said.contains("no GigE Vision camera answers there"), "{said}");
 }
 
-/// What comes first of a camera that describes itself wrongly: frames by what can be read of it, or trouble.
+/// What comes first of a camera that describes itself wrongly: frames by what can be read of it, or
+/// trouble.
 fn first_of(last: u8, describes: fn(String) -> String) -> LiveEvent {
     let camera = Fake::start(address(last), Behaviour { describes, ..own_clock() });
     watched(&camera).next(Duration::from_secs(10))

@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::Path;
 
-use crossfix_video::{Frame, FrameClock, Pixels, VideoError, decode_still, open};
+use crossfix_video::{Frame, FrameClock, Pixels, Still, VideoError, decode_still, open};
 use proptest::prelude::*;
 
 fn png(
@@ -74,9 +74,11 @@ fn a_corrupt_png_costs_one_frame() {
 #[test]
 fn sixteen_bits_and_colour_are_kept() {
     let deep = png(1, 1, png::ColorType::Grayscale, png::BitDepth::Sixteen, &[0x12, 0x34]);
-    assert_eq!(decode_still(&deep).unwrap(), (1, 1, Pixels::Gray16(vec![0x1234])));
+    let pixels = Pixels::Gray16(vec![0x1234]);
+    assert_eq!(decode_still(&deep).unwrap(), Still { width: 1, height: 1, pixels });
     let colour = png(1, 1, png::ColorType::Rgba, png::BitDepth::Eight, &[1, 2, 3, 255]);
-    assert_eq!(decode_still(&colour).unwrap(), (1, 1, Pixels::Rgb8(vec![1, 2, 3])));
+    let pixels = Pixels::Rgb8(vec![1, 2, 3]);
+    assert_eq!(decode_still(&colour).unwrap(), Still { width: 1, height: 1, pixels });
 }
 
 #[test]

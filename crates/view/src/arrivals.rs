@@ -9,9 +9,9 @@ const FRAMES_A_CAMERA: usize = 1000;
 
 /// Arrival times of each camera's frames, kept until the tracks that follow from them come.
 #[derive(Debug, Default)]
-pub(crate) struct Arrivals(BTreeMap<String, BTreeMap<u64, Timestamp>>);
+pub(crate) struct FrameArrivals(BTreeMap<String, BTreeMap<u64, Timestamp>>);
 
-impl Arrivals {
+impl FrameArrivals {
     /// Notes the arrival of a camera's frame.
     pub(crate) fn note(&mut self, camera: &str, sequence: u64, arrival: Timestamp) {
         let frames = self.0.entry(camera.to_owned()).or_default();
@@ -39,7 +39,7 @@ mod tests {
 
     #[test]
     fn frames_of_another_run_are_forgotten_and_memory_is_bounded() {
-        let mut arrivals = Arrivals::default();
+        let mut arrivals = FrameArrivals::default();
         for sequence in 0..5000 {
             arrivals.note("a", sequence, Timestamp::from_nanos(sequence as i64));
         }

@@ -13,7 +13,7 @@ use rerun_types::components::Color;
 use rerun_types::datatypes::Range2D;
 
 use crate::earth::{Earth, MAP};
-use crate::extent::Extent;
+use crate::extent::BoundingBox;
 use crate::paths::{TIMELINE, image_path};
 use crate::{ViewError, eye};
 
@@ -31,7 +31,7 @@ pub(crate) struct CameraPanel {
 pub(crate) fn send(
     stream: &RecordingStream,
     cameras: &[CameraPanel],
-    extent: &Extent,
+    extent: &BoundingBox,
     earth: Option<&Earth>,
 ) -> Result<(), ViewError> {
     let (site, site_path) = site_view();
@@ -109,7 +109,7 @@ fn without_panels(root: impl Into<ContainerLike>) -> Blueprint {
 pub(crate) fn send_flight(
     stream: &RecordingStream,
     cameras: &[String],
-    extent: &Extent,
+    extent: &BoundingBox,
 ) -> Result<(), ViewError> {
     let (site, site_path) = site_view();
     let below: [ContainerLike; 2] = [
@@ -127,7 +127,10 @@ pub(crate) fn send_flight(
 }
 
 /// Sends the layout of several runs: the site, and below it their errors and the legend.
-pub(crate) fn send_comparison(stream: &RecordingStream, extent: &Extent) -> Result<(), ViewError> {
+pub(crate) fn send_comparison(
+    stream: &RecordingStream,
+    extent: &BoundingBox,
+) -> Result<(), ViewError> {
     let (site, site_path) = site_view();
     let below: [ContainerLike; 2] = [
         TimeSeriesView::new("error [m]").with_origin("/plots/error").into(),
@@ -153,7 +156,7 @@ pub(crate) fn send_volume(
     .with_column_shares([0.4, 1.0]);
     let root = Horizontal::new([site, right.into()]).with_column_shares([1.8, 1.0]);
     let time = TimePanel::new().with_state(PanelState::Collapsed);
-    let extent = Extent::of(places.iter().copied());
+    let extent = BoundingBox::of(places.iter().copied());
     send_site(stream, &without_panels(root).with_time_panel(time), site_path, &extent, vec![])
 }
 
@@ -178,7 +181,7 @@ fn send_site(
     stream: &RecordingStream,
     blueprint: &Blueprint,
     site_path: Option<EntityPath>,
-    extent: &Extent,
+    extent: &BoundingBox,
     zooms: Vec<(EntityPath, &dyn AsComponents)>,
 ) -> Result<(), ViewError> {
     let background =

@@ -1,11 +1,13 @@
 use crossfix_message::TrackNumber;
 use rerun_types::components::Color;
 
-/// Colours of cameras: they can be told apart, also by those who confuse red and green.
+/// Colours of cameras, red, green and blue: they can be distinguished, also by those who confuse
+/// red and green (Okabe and Ito's). With half of them the fourth camera has the first one's.
 const PALETTE: [[u8; 3]; 6] =
     [[230, 159, 0], [86, 180, 233], [0, 158, 115], [240, 228, 66], [0, 114, 178], [180, 180, 180]];
 
-/// Colours of tracks: none is a camera's, and the first two are a warm and a cold one.
+/// Colours of tracks, red, green and blue: none is a camera's. With half of them the third track
+/// has the first one's.
 const TRACKS: [[u8; 3]; 5] =
     [[255, 190, 225], [255, 80, 70], [185, 130, 255], [255, 60, 190], [190, 120, 90]];
 
@@ -39,7 +41,8 @@ pub(crate) fn faint(index: u64, alpha: u8) -> Color {
 }
 
 /// Colour scale from dark to light, even to the eye, also to those who confuse red and green
-/// (matplotlib's viridis).
+/// (matplotlib's viridis, at nine places). With half of the places the colours between would be
+/// greyer.
 const SCALE: [[u8; 3]; 9] = [
     [68, 1, 84],
     [71, 44, 122],

@@ -9,11 +9,11 @@ use rerun_types::archetypes::{
 use rerun_types::components::{Color, MediaType, Radius};
 
 use crate::draw::f32s;
-use crate::extent::Extent;
+use crate::extent::BoundingBox;
 use crate::paths::TIMELINE;
 use crate::{ViewError, blueprint, colour, ground};
 
-/// Colour of the true targets.
+/// Colour of the true targets: white, as no run's.
 const TRUTH: Color = Color(rerun_types::datatypes::Rgba32::from_rgb(240, 240, 240));
 /// Longest gap between two places that are joined by a line, s: over a longer one the track was
 /// lost. With half of it instants that are half a second apart are not joined.
@@ -63,7 +63,7 @@ impl ComparisonPicture {
             draw_ways(stream, &format!("world/runs/{index}"), &run.tracks, colour)?;
             self.draw_errors(stream, index, run, colour)?;
         }
-        let extent = Extent::of(self.truth.iter().map(|at| at.place));
+        let extent = BoundingBox::of(self.truth.iter().map(|at| at.place));
         ground::draw(stream, &extent)?;
         let legend = TextDocument::new(self.legend()).with_media_type(MediaType::markdown());
         stream.log_static("legend", &legend)?;
@@ -103,8 +103,8 @@ impl ComparisonPicture {
             format!("- rgb {r} {g} {b}: {}\n", run.name)
         });
         format!(
-            "**White**: where the targets were. **In a run's colour**: its tracks, and below how far \
-             each of its answers is from the nearest target.\n\n{}",
+            "**White**: where the targets were. **In a run's colour**: its tracks, and below how \
+             far each of its answers is from the nearest target.\n\n{}",
             runs.collect::<String>()
         )
     }

@@ -9,10 +9,10 @@ use rerun_types::blueprint::archetypes::MapZoom;
 use rerun_types::components::{AlbedoFactor, Color, Radius};
 use rerun_types::datatypes::Rgba32;
 
-use crate::extent::Extent;
+use crate::extent::{BoundingBox, Bounds};
 use crate::{ViewError, draw};
 
-/// Entity path from which the map view takes its points.
+/// Entity path from which the map view takes its points: any name that nothing else has.
 pub(crate) const MAP: &str = "map";
 /// Entity path of the picture of the ground.
 const PICTURE: &str = "world/ground/picture";
@@ -24,9 +24,10 @@ const DIMMED: u8 = 130;
 const BELOW_GRID: f64 = 1e-3;
 
 /// Size of a point of the map at the equator, at the zoom where the whole map is 256 points wide,
-/// m.
+/// m: the Earth's circumference over 256. With half of it the site would be half as large as it
+/// should.
 const WHOLE_MAP_M: f64 = 156_543.0;
-/// Length of the site's diagonal on the map, points: so it fits into the smallest view. With half
+/// Length of the site's diagonal on the map, points: it fits into the smallest view. With half
 /// of it the map shows twice as far; with twice as much the site is cut off in a small view.
 const SITE_POINTS: f64 = 250.0;
 
@@ -75,14 +76,15 @@ impl Earth {
             .with_albedo_texture_image(Image::from_rgb24(picture.rgb, picture.size))
     }
 
+    /// Latitude and longitude, deg: a pair, as Rerun takes it.
     fn lat_lon(&self, point: Point3<f64>) -> (f64, f64) {
         let place = self.frame.geodetic(point);
         (place.latitude_deg(), place.longitude_deg())
     }
 
     /// The zoom at which the map shows the whole site.
-    pub(crate) fn zoom(&self, extent: &Extent) -> MapZoom {
-        let (low, high) = extent.bounds();
+    pub(crate) fn zoom(&self, extent: &BoundingBox) -> MapZoom {
+        let Bounds { low, high } = extent.bounds();
         let across = (high - low).norm().max(1.0);
         let (latitude_deg, _) = self.lat_lon(extent.middle());
         // metres per point at zoom z: WHOLE_MAP_M cos(latitude) / 2^z
@@ -104,7 +106,7 @@ impl Earth {
         Ok(stream.log_static(format!("{MAP}/cameras/{name}"), &point)?)
     }
 
-    /// Draws a track on the map, with its trail; a track of one camera is taken off the map.
+    /// Draws a track on the map, with its trail; a track of one camera is removed from the map.
     pub(crate) fn track(
         &self,
         stream: &RecordingStream,
@@ -128,7 +130,7 @@ impl Earth {
         Ok(stream.log(format!("{MAP}/tracks/{id}/trail"), &way)?)
     }
 
-    /// Takes an ended track off the map.
+    /// Removes an ended track from the map.
     pub(crate) fn clear(&self, stream: &RecordingStream, id: u64) -> Result<(), ViewError> {
         Ok(stream.log(format!("{MAP}/tracks/{id}"), &Clear::recursive())?)
     }
@@ -137,12 +139,12 @@ impl Earth {
     pub(crate) fn ground(
         &self,
         stream: &RecordingStream,
-        extent: &Extent,
+        extent: &BoundingBox,
     ) -> Result<(), ViewError> {
         if !self.has_picture {
             return Ok(());
         }
-        let (low, high) = extent.bounds();
+        let Bounds { low, high } = extent.bounds();
         let height = low.z - BELOW_GRID * (high - low).norm();
         Ok(stream.log_static(PICTURE, &Transform3D::from_translation([0.0, 0.0, height as f32]))?)
     }

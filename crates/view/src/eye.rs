@@ -4,27 +4,29 @@ use nalgebra::{Point3, Vector3};
 use rerun_types::blueprint::archetypes::EyeControls3D;
 use rerun_types::blueprint::components::Eye3DKind;
 
-use crate::extent::Extent;
+use crate::extent::BoundingBox;
 
-/// Tangent of half of Rerun's vertical field of view (55 degrees in all).
+/// Tangent of half of Rerun's vertical field of view (55 degrees in all). With half of it the eye
+/// would be twice as far away as it must.
 const HALF_HEIGHT: f64 = 0.52;
-/// The same horizontally, for a view that is wider than high.
+/// The same horizontally, for a view that is wider than high. With half of it a wide site would be
+/// seen from twice as far away.
 const HALF_WIDTH: f64 = 1.5 * HALF_HEIGHT;
 /// Factor on the distance that leaves room for labels at the borders. At 1 the labels of the
-/// outermost cameras are cut off.
+/// outermost cameras are cut off; with half of it half of the site is outside of the view.
 const ROOM: f64 = 1.1;
 /// Number of iterations: after these the target moves by less than a pixel. With half of it the
 /// site lies a little beside the middle.
 const CENTRINGS: u32 = 4;
-/// Least distance from which anything is looked at, m. With half of it the eye would look from
+/// Least distance of the eye, m. With half of it the eye would be
 /// within a frustum, which is 12 m long.
 const CLOSEST_M: f64 = 20.0;
 
 /// An eye that has a whole box in view, from the south and above, so that north is up in the
 /// picture.
-pub(crate) fn on(extent: &Extent) -> EyeControls3D {
+pub(crate) fn on(extent: &BoundingBox) -> EyeControls3D {
     let f32s = |point: Point3<f64>| [point.x as f32, point.y as f32, point.z as f32];
-    let (eye, target) = eye_and_target(extent);
+    let EyePlace { eye, target } = place_eye(extent);
     EyeControls3D::new()
         .with_kind(Eye3DKind::Orbital)
         .with_position(f32s(eye))
@@ -32,7 +34,7 @@ pub(crate) fn on(extent: &Extent) -> EyeControls3D {
         .with_eye_up([0.0_f32, 0.0, 1.0])
 }
 
-/// A direction to look in, at a target.
+/// A line of sight to a target.
 struct Gaze {
     target: Point3<f64>,
     towards_eye: Vector3<f64>,
@@ -60,7 +62,7 @@ impl Gaze {
 
     /// Half-way between the outermost corners along an axis, as seen from a distance: as a length
     /// at the target.
-    fn middle(&self, extent: &Extent, axis: &Vector3<f64>, distance: f64) -> f64 {
+    fn middle(&self, extent: &BoundingBox, axis: &Vector3<f64>, distance: f64) -> f64 {
         let seen = extent.corners().map(|corner| self.seen(corner, axis, distance));
         let (low, high) = seen.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), seen| {
             (low.min(seen), high.max(seen))
@@ -69,8 +71,14 @@ impl Gaze {
     }
 }
 
-/// Where the eye is, and the point that it looks at.
-fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
+/// Where the eye is, and the point in the middle of its view.
+struct EyePlace {
+    eye: Point3<f64>,
+    target: Point3<f64>,
+}
+
+/// The eye that has a whole box in view.
+fn place_eye(extent: &BoundingBox) -> EyePlace {
     let towards_eye = Vector3::new(-0.35, -1.0, 0.75).normalize();
     let right = Vector3::z().cross(&towards_eye).normalize();
     let up = towards_eye.cross(&right);
@@ -84,7 +92,7 @@ fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
         gaze.target +=
             gaze.middle(extent, &right, distance) * right + gaze.middle(extent, &up, distance) * up;
     }
-    (gaze.target + ROOM * distance * towards_eye, gaze.target)
+    EyePlace { eye: gaze.target + ROOM * distance * towards_eye, target: gaze.target }
 }
 
 #[cfg(test)]
@@ -96,11 +104,11 @@ mod tests {
         for [width, depth, height] in
             [[100.0, 100.0, 30.0], [400.0, 20.0, 5.0], [10.0, 10.0, 300.0]]
         {
-            let extent = Extent::of([
+            let extent = BoundingBox::of([
                 Point3::new(-50.0, 7.0, 2.0),
                 Point3::new(width - 50.0, 7.0 + depth, height),
             ]);
-            let (place, target) = eye_and_target(&extent);
+            let EyePlace { eye: place, target } = place_eye(&extent);
             let forward = (target - place).normalize();
             let right = forward.cross(&Vector3::z()).normalize();
             let up = right.cross(&forward);

@@ -9,16 +9,16 @@ use rerun_types::archetypes::{
 use rerun_types::components::{Color, FillMode, MediaType, Radius};
 
 use crate::draw::{ENLARGED, ENLARGED_UP_TO_M, SIGMAS, f32s};
-use crate::extent::Extent;
+use crate::extent::BoundingBox;
 use crate::paths::{TIMELINE, image_path};
 use crate::{ViewError, blueprint, colour, draw, ground};
 
-/// Most labels of a camera that are drawn, each at its time: so a picture of ten minutes opens at
-/// once. With half of it such a picture has a label every 0.4 s and not every 0.2.
+/// Most labels of a camera that are drawn, each at its time: a picture of ten minutes opens at
+/// once with so few. With half of it such a picture has a label every 0.4 s and not every 0.2.
 const MOST_SHOWN: usize = 3000;
-/// Colour of the target's trajectory and of what belongs to no camera.
+/// Colour of the target's trajectory and of what belongs to no camera: white, as no camera's.
 const WAY: Color = Color(rerun_types::datatypes::Rgba32::from_rgb(240, 240, 240));
-/// Colour of the log.
+/// Colour of the log: pink, as no camera's.
 const LOG: Color = Color(rerun_types::datatypes::Rgba32::from_rgb(240, 90, 200));
 
 /// A label of a camera's target, and where the camera should see it.
@@ -93,7 +93,7 @@ impl FlightPicture<'_> {
             )?;
         }
         let centres = self.cameras.iter().map(|camera| camera.camera.pose().position());
-        let extent = Extent::of(centres.chain(way.iter().map(|(_, place)| *place)));
+        let extent = BoundingBox::of(centres.chain(way.iter().map(|(_, place)| *place)));
         ground::draw(stream, &extent)?;
         self.draw_legend(stream)?;
         let names: Vec<String> = self.cameras.iter().map(|camera| camera.name.clone()).collect();
@@ -132,10 +132,10 @@ impl FlightPicture<'_> {
         };
         let text = format!(
             "**White**: the way of the target that all cameras have made.\n\n{log}\
-             **In the images**: a camera's labels in its colour; at the time shown, the label and a white point \
-             where the target should be seen.\n\n\
-             **Ellipsoid** about a camera: {SIGMAS} standard deviations of its centre, drawn {ENLARGED} times \
-             too large where they are below {ENLARGED_UP_TO_M} m."
+             **In the images**: a camera's labels in its colour; at the time shown, the label and \
+             a white point where the target should be seen.\n\n\
+             **Ellipsoid** about a camera: {SIGMAS} standard deviations of its centre, drawn \
+             {ENLARGED} times too large where they are below {ENLARGED_UP_TO_M} m."
         );
         let words = TextDocument::new(text).with_media_type(MediaType::markdown());
         stream.log_static("legend", &words)?;

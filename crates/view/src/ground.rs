@@ -6,7 +6,7 @@ use rerun_types::archetypes::{Arrows3D, LineStrips3D, Points3D};
 use rerun_types::components::{Color, Radius};
 
 use crate::ViewError;
-use crate::extent::Extent;
+use crate::extent::{BoundingBox, Bounds};
 
 /// Approximate number of grid cells along its longer side: enough to count by, few enough not to
 /// hide anything. With half of it they are of 20 m instead of 10 in a site of 100 m.
@@ -18,20 +18,22 @@ fn round_length(length: f64) -> f64 {
     [5.0, 2.0, 1.0].into_iter().map(|m| m * power).find(|&m| m <= length).unwrap_or(power)
 }
 
+/// Coordinates of the grid's lines on an axis, a cell apart.
+fn grid_lines(from: f64, to: f64, cell: f64) -> impl Iterator<Item = f64> {
+    (0..=((to - from) / cell).round() as u32).map(move |i| from + f64::from(i) * cell)
+}
+
 /// Draws the ground under a box, at its lowest height.
-pub(crate) fn draw(stream: &RecordingStream, extent: &Extent) -> Result<(), ViewError> {
-    let (low, high) = extent.bounds();
+pub(crate) fn draw(stream: &RecordingStream, extent: &BoundingBox) -> Result<(), ViewError> {
+    let Bounds { low, high } = extent.bounds();
     let longest = (high.x - low.x).max(high.y - low.y).max(1.0);
     let cell = round_length(longest / CELLS);
     let [west, south] = [low.x, low.y].map(|v| (v / cell).floor() * cell);
     let [east, north] = [high.x, high.y].map(|v| (v / cell).ceil() * cell);
     let point = |x: f64, y: f64| [x as f32, y as f32, low.z as f32];
-    let lines = |from: f64, to: f64| {
-        (0..=((to - from) / cell).round() as u32).map(move |i| from + f64::from(i) * cell)
-    };
-    let strips = lines(west, east)
+    let strips = grid_lines(west, east, cell)
         .map(|x| [point(x, south), point(x, north)])
-        .chain(lines(south, north).map(|y| [point(west, y), point(east, y)]));
+        .chain(grid_lines(south, north, cell).map(|y| [point(west, y), point(east, y)]));
     let faint = Color::from_rgb(52, 58, 74);
     stream.log_static(
         "world/ground/grid",

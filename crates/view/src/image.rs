@@ -20,12 +20,12 @@ const CORNERS: usize = 24;
 
 /// The part of a camera's image in which targets were, pixels of the camera.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Region {
+pub(crate) struct TargetRegion {
     low: Vector2<f64>,
     high: Vector2<f64>,
 }
 
-impl Region {
+impl TargetRegion {
     /// Enlarges the region to contain a pixel; a pixel that is not finite is ignored.
     pub(crate) fn include(region: &mut Option<Self>, [x, y]: [f64; 2]) {
         let place = Vector2::new(x, y);
@@ -78,7 +78,7 @@ pub(crate) fn boxes(
             // Labels would hide targets of a few pixels.
             .with_show_labels(false)
             .with_colors([colour::of(index)])
-            .with_radii([Radius::new_ui_points(1.0)]),
+            .with_radii([Radius::new_ui_points(0.6)]),
     )?;
     let centres = boxes().map(|t| (scaled(t.pixel_x + 0.5), scaled(t.pixel_y + 0.5)));
     let sizes = boxes().map(|t| (scaled(GATE_SIDES * t.width), scaled(GATE_SIDES * t.height)));
@@ -180,9 +180,9 @@ mod tests {
     #[test]
     fn what_is_shown_has_the_images_form_and_lies_in_it() {
         let mut region = None;
-        Region::include(&mut region, [10.0, 20.0]);
-        Region::include(&mut region, [110.0, f64::NAN]);
-        Region::include(&mut region, [110.0, 40.0]);
+        TargetRegion::include(&mut region, [10.0, 20.0]);
+        TargetRegion::include(&mut region, [110.0, f64::NAN]);
+        TargetRegion::include(&mut region, [110.0, 40.0]);
         let [[left, top], [right, bottom]] = region.unwrap().shown(&camera(), 0.5);
         assert_eq!([left, top], [0.0, 0.0]);
         assert_eq!((right - left) / (bottom - top), 2.0);

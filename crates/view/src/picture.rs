@@ -11,30 +11,33 @@ use rerun::RecordingStream;
 use rerun_types::archetypes::{Clear, EncodedImage, Points3D, Scalars, TextLog, ViewCoordinates};
 use rerun_types::components::{Color, MediaType, Radius, TextLogLevel};
 
-use crate::arrivals::Arrivals;
+use crate::arrivals::FrameArrivals;
 use crate::earth::{Earth, GroundPicture};
-use crate::extent::Extent;
-use crate::image::{self, Region, Ring};
+use crate::extent::BoundingBox;
+use crate::image::{self, Ring, TargetRegion};
 use crate::limiter::Limiter;
 use crate::paths::{TIMELINE, image_path};
 use crate::trail::Trail;
 use crate::{ViewError, ViewerWatch, blueprint, colour, draw, ground, legend};
 
-/// Most drawings per second: a camera's previews, a camera's sight lines, and a track. With half of
-/// these rates the picture jerks; with twice as much the viewer's memory lasts half as long.
+/// Most drawings per second of a camera's previews. With half of it they jerk; with twice as much
+/// the viewer's memory, most of which is images, lasts half as long.
 const PREVIEW_RATE_HZ: f64 = 5.0;
+/// Most drawings per second of a camera's sight lines. With half of it they lag behind the tracks.
 const LINE_RATE_HZ: f64 = 10.0;
+/// Most drawings per second of a track. With half of it it jerks; with twice as much it takes twice
+/// the viewer's memory.
 const TRACK_RATE_HZ: f64 = 15.0;
 /// Most fusion centres whose problems are remembered. Those of one more are written again with each
 /// of its reports; with half of it, from the 501st on.
 const MOST_CENTRES: usize = 1000;
-/// Length of sight lines as long as no track tells how far they should reach, m. With half of it
+/// Length of sight lines as long as no track shows how far they should reach, m. With half of it
 /// the lines of cameras 200 m apart do not cross.
 const DEFAULT_REACH_M: f64 = 150.0;
 /// Height above the cameras where targets are expected, as long as no track shows them, m. With
 /// half of it the first track may begin outside of the view, which is then laid out again.
 const AIR_M: f64 = 25.0;
-/// A track of which nothing was heard for this long is removed, s: each is sent twice a second, so
+/// A track of which no message came for this long is removed, s: each is sent twice a second, so
 /// its fusion centre is gone. With half of it tracks vanish where a link stalls for two seconds.
 const GHOST_S: f64 = 3.0;
 
@@ -55,16 +58,26 @@ enum Shown {
 struct CameraView {
     index: u64,
     calibration: Calibration,
-    /// The camera as it looks now: on a mount, as its last frame said.
+    /// The camera as it points now: on a mount, as its last frame said.
     camera: Camera,
     scale: f64,
     /// Hash of the calibration that is drawn.
     hash: Vec<u8>,
     /// The part of its images in which targets were seen.
-    region: Option<Region>,
+    region: Option<TargetRegion>,
 }
 
 impl CameraView {
+    /// Low and high corner of the part of its images to show; `None` for all of them.
+    fn part(&self, shown: Shown) -> Option<[[f64; 2]; 2]> {
+        match shown {
+            Shown::WholeImages => None,
+            Shown::WhereTargetsWere => {
+                self.region.map(|region| region.shown(&self.camera, self.scale))
+            }
+        }
+    }
+
     /// Turns a camera on a mount to the pointing that a frame states.
     fn point(&mut self, stream: &RecordingStream, frame: &BearingFrame) -> Result<(), ViewError> {
         if self.calibration.mount.is_none() {
@@ -85,26 +98,26 @@ struct DrawnTrack {
     time: Timestamp,
     place: Point3<f64>,
     /// Arrival of the last message about it.
-    heard: Timestamp,
+    arrival: Timestamp,
 }
 
 /// Draws a site's messages.
-pub struct Picture {
+pub struct SitePicture {
     stream: RecordingStream,
     cameras: BTreeMap<String, CameraView>,
     trails: BTreeMap<u64, Trail>,
     drawn: BTreeMap<u64, DrawnTrack>,
     limiter: Limiter,
-    arrivals: Arrivals,
+    arrivals: FrameArrivals,
     viewer: ViewerWatch,
     earth: Option<Earth>,
     /// Extent of where confirmed tracks have been.
-    flown: Extent,
+    flown: BoundingBox,
     /// The problems that each fusion centre reported last.
     problems: BTreeMap<String, Vec<String>>,
 }
 
-impl Picture {
+impl SitePicture {
     /// An empty picture on a stream of [`crate::save`] or [`crate::connect`].
     ///
     /// # Errors
@@ -119,10 +132,10 @@ impl Picture {
             trails: BTreeMap::new(),
             drawn: BTreeMap::new(),
             limiter: Limiter::default(),
-            arrivals: Arrivals::default(),
+            arrivals: FrameArrivals::default(),
             viewer: ViewerWatch::default(),
             earth: None,
-            flown: Extent::default(),
+            flown: BoundingBox::default(),
             problems: BTreeMap::new(),
         })
     }
@@ -190,7 +203,7 @@ impl Picture {
 
     /// Whether the viewer is gone for good; meant to be asked about once a second.
     pub fn has_lost_its_viewer(&self) -> bool {
-        self.viewer.look(&self.stream);
+        self.viewer.check(&self.stream);
         self.viewer.is_gone()
     }
 
@@ -236,7 +249,7 @@ impl Picture {
     /// Lays the picture out about the cameras and tracks known so far.
     fn lay_out(&self, shown: Shown) -> Result<(), ViewError> {
         let mut extent =
-            Extent::of(self.cameras.values().map(|view| view.camera.pose().position()));
+            BoundingBox::of(self.cameras.values().map(|view| view.camera.pose().position()));
         if self.flown.is_empty() {
             // No track yet: includes the air where targets are likely to be.
             extent.include(extent.middle() + Vector3::z() * AIR_M);
@@ -252,12 +265,7 @@ impl Picture {
             .iter()
             .map(|(name, view)| blueprint::CameraPanel {
                 name: name.clone(),
-                shown: match shown {
-                    Shown::WholeImages => None,
-                    Shown::WhereTargetsWere => {
-                        view.region.map(|region| region.shown(&view.camera, view.scale))
-                    }
-                },
+                shown: view.part(shown),
             })
             .collect();
         blueprint::send(&self.stream, &cameras, &extent, self.earth.as_ref())
@@ -298,7 +306,9 @@ impl Picture {
         let farthest = placed.map(|drawn| (drawn.place - origin).norm()).fold(0.0, f64::max);
         let reach = if farthest > 0.0 { 1.1 * farthest } else { DEFAULT_REACH_M };
         let seen = frame.tracks.iter().filter(|track| track.state() == ImageTrackState::Tracking);
-        seen.for_each(|track| Region::include(&mut view.region, [track.pixel_x, track.pixel_y]));
+        seen.for_each(|track| {
+            TargetRegion::include(&mut view.region, [track.pixel_x, track.pixel_y]);
+        });
         draw::bearings(&self.stream, frame, view.index, &view.camera, reach)?;
         image::boxes(&self.stream, &frame.camera, view.index, &frame.tracks, view.scale)
     }
@@ -321,7 +331,7 @@ impl Picture {
             };
             let drawn = self.drawn.get_mut(&track.id);
             let since = drawn.map(|drawn| {
-                drawn.heard = arrival;
+                drawn.arrival = arrival;
                 time.seconds_since(drawn.time)
             });
             if since.is_some_and(|since| (0.0..TRACK_RATE_HZ.recip()).contains(&since)) {
@@ -331,8 +341,7 @@ impl Picture {
             draw::track(&self.stream, track)?;
             let trail = self.trails.entry(track.id).or_default();
             trail.go_on(&self.stream, self.earth.as_ref(), track, place, time)?;
-            self.drawn
-                .insert(track.id, DrawnTrack { track: track.clone(), time, place, heard: arrival });
+            self.drawn.insert(track.id, DrawnTrack { track: track.clone(), time, place, arrival });
             let is_sure = draw::position_sd(track) < LAID_OUT_SD_M;
             if track.state() == TrackState::Confirmed && is_sure {
                 let is_first = self.flown.is_empty();
@@ -358,22 +367,23 @@ impl Picture {
         Ok(())
     }
 
-    /// Removes tracks of which nothing is heard any more while bearings still come. They must be
+    /// Removes tracks of which no message comes any more while bearings still do. They must be
     /// old both by arrival, as one camera's clock may be wrong, and by data time, as a recording's
     /// tracks may have been made long after its bearings.
     fn clear_ghosts(&mut self, arrival: Timestamp, time: Timestamp) -> Result<(), ViewError> {
         self.clear_if(|drawn| {
-            arrival.seconds_since(drawn.heard) > GHOST_S && time.seconds_since(drawn.time) > GHOST_S
+            arrival.seconds_since(drawn.arrival) > GHOST_S
+                && time.seconds_since(drawn.time) > GHOST_S
         })
     }
 
-    /// Removes tracks of which nothing was heard for a while, in a live picture that may receive
+    /// Removes tracks of which no message came for a while, in a live picture that may receive
     /// nothing at all any more; `now` is read from the clock of the arrivals.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
     pub fn clear_silent(&mut self, now: Timestamp) -> Result<(), ViewError> {
-        self.clear_if(|drawn| now.seconds_since(drawn.heard) > GHOST_S)
+        self.clear_if(|drawn| now.seconds_since(drawn.arrival) > GHOST_S)
     }
 
     fn clear_if(&mut self, is_gone: impl Fn(&DrawnTrack) -> bool) -> Result<(), ViewError> {
@@ -426,7 +436,7 @@ impl Picture {
         Ok(self.stream.log("events", &TextLog::new(text))?)
     }
 
-    /// Draws the problems of a fusion centre that a person should look at, when they begin.
+    /// Draws the problems of a fusion centre that a person should see to, when they begin.
     fn health(&mut self, health: &Health) -> Result<(), ViewError> {
         if health.time_ns == 0 {
             return Ok(());

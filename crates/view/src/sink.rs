@@ -107,7 +107,7 @@ pub struct ViewerWatch(Arc<AtomicBool>);
 
 impl ViewerWatch {
     /// Checks again. The result comes later, when the stream's own thread gets to it.
-    pub fn look(&self, stream: &RecordingStream) {
+    pub fn check(&self, stream: &RecordingStream) {
         let gone = Arc::clone(&self.0);
         stream.inspect_sink(move |sink| {
             let sink: &dyn Any = sink;

@@ -55,9 +55,14 @@ pub struct TrackingPicture {
     stream: RecordingStream,
 }
 
+/// Colour of a target that was measured, red, green and blue: green, as of a light that is on. Like
+/// those below it is bright enough for any video; with half of its levels it is lost on dark ones.
 const SEEN: [u8; 3] = [80, 220, 100];
+/// Colour of a target whose place is predicted: amber, between the two others.
 const COASTING: [u8; 3] = [250, 200, 60];
+/// Colour of a target that is searched for: red.
 const LOST: [u8; 3] = [240, 80, 80];
+/// Colour of a label: blue, as no target's.
 const LABEL: [u8; 3] = [120, 170, 255];
 
 fn colour(sight: Sight) -> Color {
@@ -78,10 +83,17 @@ fn name(target: &FollowedTarget) -> String {
     format!("{} {sight}", target.number)
 }
 
-fn boxes(drawn: impl Iterator<Item = (ImageBox, Color, String)>) -> Boxes2D {
+/// A box with its colour and name.
+struct NamedBox {
+    place: ImageBox,
+    colour: Color,
+    name: String,
+}
+
+fn boxes(drawn: impl Iterator<Item = NamedBox>) -> Boxes2D {
     let (mut corners, mut sides, mut colours, mut names) =
         (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-    for (ImageBox { x, y, width, height }, colour, name) in drawn {
+    for NamedBox { place: ImageBox { x, y, width, height }, colour, name } in drawn {
         corners.push((x as f32, y as f32));
         sides.push((width as f32, height as f32));
         colours.push(colour);
@@ -125,15 +137,18 @@ impl TrackingPicture {
         match label {
             Some(label) => {
                 let [red, green, blue] = LABEL;
-                let label = (label, Color::from_rgb(red, green, blue), "label".to_owned());
+                let colour = Color::from_rgb(red, green, blue);
+                let label = NamedBox { place: label, colour, name: "label".to_owned() };
                 stream.log("video/label", &boxes(std::iter::once(label)))?;
             }
             None => stream.log("video/label", &Clear::flat())?,
         }
-        stream.log(
-            "video/targets",
-            &boxes(targets.iter().map(|target| (target.place, colour(target.sight), name(target)))),
-        )?;
+        let named = targets.iter().map(|target| NamedBox {
+            place: target.place,
+            colour: colour(target.sight),
+            name: name(target),
+        });
+        stream.log("video/targets", &boxes(named))?;
         let measured =
             targets.iter().filter_map(|target| Some((target.measured?, colour(target.sight))));
         let (places, colours): (Vec<_>, Vec<_>) =

@@ -16,7 +16,7 @@ const TRAIL_RATE_HZ: f64 = 7.5;
 /// takes twice the viewer's memory.
 const TRAIL_POINTS: usize = 75;
 /// Rate at which a track's whole trail is drawn on the map, Hz; between two drawings a track moves
-/// by less than a point of the screen.
+/// by less than a point of the screen. With half of it it jumps by a point or two.
 const MAP_RATE_HZ: f64 = 2.0;
 
 /// The trail of a track.

@@ -14,7 +14,8 @@ const DRAWN_SHARE: f64 = 0.3;
 /// Opacity of the cubes, of 255. With half of it colours mix with those behind; opaque cubes hide
 /// them.
 const OPACITY: u8 = 150;
-/// Width and height of the colour scale's picture, pixels.
+/// Width and height of the colour scale's picture, pixels: high enough for its labels. With half of
+/// it they would touch.
 const SCALE_PX: [u32; 2] = [40, 400];
 /// Number of labelled values beside the scale. With half of it values between them are hard to
 /// guess, as the scale is logarithmic.
@@ -56,12 +57,12 @@ pub struct VolumePicture<'a> {
 
 /// Logarithmic colour scale from the best to the worst standard deviation, without the best and the
 /// worst twentieth of the cells.
-struct Scale {
+struct ColourScale {
     best: f64,
     worst: f64,
 }
 
-impl Scale {
+impl ColourScale {
     fn of(cells: &[VolumeCell]) -> Self {
         let mut deviations: Vec<f64> =
             cells.iter().map(|cell| cell.sd_m).filter(|sd| *sd > 0.0).collect();
@@ -102,7 +103,7 @@ impl VolumePicture<'_> {
         for (index, (name, camera)) in self.cameras.iter().enumerate() {
             draw::camera(stream, name, index as u64, camera, 1.0)?;
         }
-        let scale = Scale::of(&self.cells);
+        let scale = ColourScale::of(&self.cells);
         self.cubes(stream, &scale)?;
         self.landmarks(stream, &scale)?;
         draw_scale(stream, &scale)?;
@@ -115,7 +116,7 @@ impl VolumePicture<'_> {
         stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
     }
 
-    fn cubes(&self, stream: &RecordingStream, scale: &Scale) -> Result<(), ViewError> {
+    fn cubes(&self, stream: &RecordingStream, scale: &ColourScale) -> Result<(), ViewError> {
         // A layer per height, to the centimetre.
         let mut layers: BTreeMap<i64, Vec<&VolumeCell>> = BTreeMap::new();
         for cell in &self.cells {
@@ -140,7 +141,7 @@ impl VolumePicture<'_> {
         Ok(())
     }
 
-    fn landmarks(&self, stream: &RecordingStream, scale: &Scale) -> Result<(), ViewError> {
+    fn landmarks(&self, stream: &RecordingStream, scale: &ColourScale) -> Result<(), ViewError> {
         let (named, plain): (Vec<&DrawnPlace>, Vec<&DrawnPlace>) =
             self.landmarks.iter().partition(|landmark| landmark.label.is_some());
         for (path, landmarks, radius) in
@@ -164,7 +165,7 @@ impl VolumePicture<'_> {
 }
 
 /// Draws the colour scale, with the best at the top and values beside it.
-fn draw_scale(stream: &RecordingStream, scale: &Scale) -> Result<(), ViewError> {
+fn draw_scale(stream: &RecordingStream, scale: &ColourScale) -> Result<(), ViewError> {
     let [width, height] = SCALE_PX;
     let share = |row: u32| f64::from(row) / f64::from(height - 1);
     let pixels: Vec<u8> = (0..height)
@@ -194,7 +195,7 @@ mod tests {
     #[test]
     fn the_scale_is_of_equal_factors() {
         let cell = |sd_m| VolumeCell { centre: Point3::origin(), sd_m };
-        let scale = Scale::of(&[cell(0.1), cell(10.0)]);
+        let scale = ColourScale::of(&[cell(0.1), cell(10.0)]);
         assert_eq!(scale.colour(0.1), colour::scale(1.0));
         assert_eq!(scale.colour(1.0), colour::scale(0.5));
         assert_eq!(scale.colour(10.0), colour::scale(0.0));

@@ -83,7 +83,7 @@ fn update(bencher: Bencher, scene: &Scene, reference: ReferenceStrategy) {
         tracker.take_up(PixelBox { x, y, width, height });
     }
     let mut frame = 0;
-    // Each picture is written anew before it is looked at, as by a camera's driver or a decoder.
+    // Each picture is written again before it is used, as by a camera's driver or a decoder.
     let mut next = || {
         frame += 1;
         (pictures[(frame - 1) % ROUND].clone(), Timestamp::from_seconds(frame as f64 / 30.0))

@@ -1,5 +1,5 @@
-//! Finds targets in a video, follows them, and prints where they are: what `crossfix track --detect`
-//! does, in a page.
+//! Finds targets in a video, follows them, and prints where they are: what `crossfix track
+//! --detect` does, in a page.
 //!
 //! ```text
 //! cargo run --release -p crossfix-vision --example follow_video -- clip.mp4

@@ -85,9 +85,9 @@ pub(crate) struct Appearance {
     chosen: usize,
     /// The low-passed reference, in its own size and direction.
     smooth: Plane,
-    /// See [`Self::steepness`] and [`Self::taken`].
+    /// See [`Self::steepness`] and [`Self::filtered_out`].
     steepness: [f64; 2],
-    taken: f32,
+    filtered_out: f32,
     /// Share of new images in the reference that the working reference does not contain yet;
     /// whether the working reference has the target's present size and direction; and whether the
     /// reference was like the anchor when they were compared last.
@@ -216,7 +216,7 @@ impl Appearance {
             chosen: 0,
             smooth: own.clone(),
             steepness: [1.0; 2],
-            taken: 0.0,
+            filtered_out: 0.0,
             changed: 0.0,
             is_in_shape: true,
             is_like_anchor: true,
@@ -297,8 +297,8 @@ impl Appearance {
     }
 
     /// Mean square of what the low-pass has removed from the target.
-    pub(crate) fn taken(&self) -> f32 {
-        self.taken
+    pub(crate) fn filtered_out(&self) -> f32 {
+        self.filtered_out
     }
 
     /// Share of the reference's energy that is the target's and not noise: a noisy reference finds
@@ -380,7 +380,7 @@ impl Appearance {
         let AppearanceScratch { memory, filtered, .. } = buffers;
         for (index, filter) in self.low_passes.iter().enumerate() {
             filter.apply(&self.own, memory, filtered);
-            let taken: f32 = self
+            let removed: f32 = self
                 .own
                 .samples()
                 .iter()
@@ -389,12 +389,12 @@ impl Appearance {
                 .sum();
             // Stein's unbiased estimate of the squared error, as if the truth were known: |own -
             // filtered|^2 + 2 sigma^2 tr(filter) - n sigma^2.
-            let risk = taken + pixels * noise * (2.0 * filter.own_weight() - 1.0);
+            let risk = removed + pixels * noise * (2.0 * filter.own_weight() - 1.0);
             if risk < least {
                 (least, self.chosen) = (risk, index);
-                // White noise makes sigma^2 |1 - filter|^2 per pixel of what the filter takes away.
-                let noise_taken = noise * (1.0 - 2.0 * filter.own_weight() + filter.noise_gain());
-                self.taken = (taken / pixels - noise_taken).max(0.0);
+                // White noise makes sigma^2 |1 - filter|^2 per pixel of what the filter removes.
+                let of_noise = noise * (1.0 - 2.0 * filter.own_weight() + filter.noise_gain());
+                self.filtered_out = (removed / pixels - of_noise).max(0.0);
                 self.smooth.copy_from(filtered);
             }
             if clear {
@@ -408,23 +408,20 @@ impl Appearance {
         self.steepness = steepness(&self.smooth, &self.own, answers);
         let (width, height) = (self.own.width() as f64, self.own.height() as f64);
         let Self { smooth, working, scale, turn_rad, .. } = self;
+        let [x, y] = [width, height].map(|side| (side - 1.0) / 2.0);
+        // The working reference samples the own one, so the inverse scale and turn are used.
+        let view = View { x, y, scale: 1.0 / *scale, turn_rad: -*turn_rad };
+        let sides = [width, height].map(|side| odd(*scale * side + 0.5));
         working.update(|image| {
-            image.reshape(odd(*scale * width + 0.5), odd(*scale * height + 0.5));
-            let middle = [width, height].map(|side| (side - 1.0) / 2.0);
-            // The working reference samples the own one, so the inverse scale and turn are used.
-            let (scale, turn_rad) = (1.0 / *scale, -*turn_rad);
-            buffers.resampler.resample(
-                smooth,
-                View { x: middle[0], y: middle[1], scale, turn_rad },
-                image,
-            );
+            image.reshape(sides[0], sides[1]);
+            buffers.resampler.resample(smooth, view, image);
             without_mean(image);
         });
     }
 
     /// Fits the reference to the anchor and notes its drift: each image was learned at an estimated
     /// place, and these errors add up; the anchor, to which almost nothing is added any more,
-    /// stays. Returns whether the two are alike at all.
+    /// stays. Returns whether the two are similar at all.
     fn compare_with_anchor(&mut self, buffers: &mut AppearanceScratch) -> bool {
         let index = self
             .low_passes

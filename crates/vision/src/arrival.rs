@@ -1,9 +1,9 @@
 //! Whether the thing that a target's reference is found on has come to its place, or was there
 //! before.
 //!
-//! A reference alone cannot tell: on a cloud it becomes cloud, and finds that again with certainty.
-//! The pictures of the scene ([`crate::scene`]) can: under a target that has come from elsewhere
-//! one of them shows what it hides.
+//! A reference alone does not show it: on a cloud it becomes cloud, and finds that again with
+//! certainty. The pictures of the scene ([`crate::scene`]) can: under a target that has come from
+//! elsewhere one of them shows what it hides.
 
 use crossfix_correlation::{Plane, Resampler, View};
 
@@ -17,7 +17,7 @@ use crate::scene::ScenePicture;
 const UNCHANGED: f64 = 0.1;
 /// Standard deviation of the contrast that the scene itself has in a target's place, as a share of
 /// the target's usual contrast: often it is as much as half. With half of it such a scene lies at
-/// two standard deviations, and a target that comes there is doubted.
+/// two standard deviations, and a target that comes there is taken for it.
 const SCENE_SHARE: f64 = 0.5;
 /// Standard deviation of the change in contrast of something on the lens, as the scene behind it
 /// changes, as a share of the target's usual contrast: two scenes, each with a quarter of it. With
@@ -28,26 +28,27 @@ const BEHIND: f64 = 0.35;
 /// of an unchanged scene change by up to four times the expected variance, and count as having
 /// come.
 const REGISTERED_PX: f64 = 0.25;
-/// Pixels per independent sample ("look"): neighbours are blurred and compressed together, ...
-const PIXELS_A_LOOK: f64 = 4.0;
-/// ... and a target has at most this many looks, however large: its parts change together. With
-/// half of the first a small target's blurred noise counts twice; with half of the second a large
-/// target's pixels must change by 5.3 times the expected variance instead of 3.6 to tell `MOST`.
-const MOST_LOOKS: f64 = 12.0;
-/// Most that one picture tells, either way, as a log likelihood ratio: what the model leaves out
-/// must remain possible. With half of it a target held for certain is doubted in the second image
-/// instead of the first, at 30 per second.
+/// Pixels per independent sample: neighbours are blurred and compressed together. With half of it a
+/// small target's blurred noise counts twice.
+const PIXELS_PER_SAMPLE: f64 = 4.0;
+/// Most independent samples of a target, however large: its parts change together. With half of it
+/// a large target's pixels must change by 5.3 times the expected variance instead of 3.6 to count
+/// `MOST`.
+const MOST_SAMPLES: f64 = 12.0;
+/// Most that one picture counts, either way, as a log likelihood ratio: what the model leaves out
+/// must remain possible. With half of it a target that was certain counts as unseen in the second
+/// image instead of the first, at 30 per second.
 const MOST: f64 = 8.0;
 /// Range of the factor by which light or exposure may change the contrast of a scene. With no range
 /// at all whatever is there counts as having come with every step of the light, where there is no
-/// noise to hide the difference.
+/// noise to hide the difference. With half of its width so it does with a step by two.
 const LIGHTER: [f64; 2] = [0.5, 2.0];
 /// Least share of the reference's energy that must lie where the target was not before. With half
-/// of it contrasts are told by an eighth of the energy, with eight times the whole's noise
-/// variance; with twice as much a slow target's pictures tell nothing for longer.
+/// of it contrasts are measured by an eighth of the energy, with eight times the whole's noise
+/// variance; with twice as much a slow target's pictures show nothing for longer.
 const LEAST_FREE: f64 = 0.25;
-/// Fewest pixels that tell anything. With half of it the two that are left are fitted exactly by
-/// brightness and contrast, and never change.
+/// Fewest pixels from which anything follows. With half of it the two that are left are fitted
+/// exactly by brightness and contrast, and never change.
 const LEAST_PIXELS: f64 = 4.0;
 
 /// The reference's place now, compared with that in a picture of the scene without the target.
@@ -61,8 +62,8 @@ pub(crate) struct ArrivalEvidence {
     /// Mean squared change of the pixels, over that which noise and registration make of an
     /// unchanged scene.
     change: f64,
-    /// Number of independent looks in that mean.
-    looks: f64,
+    /// Number of independent samples in that mean.
+    samples: f64,
 }
 
 /// Memory for the comparison.
@@ -89,14 +90,14 @@ impl ArrivalEvidence {
     /// If the target has come, the scene had any contrast c there before, `c ~ N(0, (usual /
     /// 2)^2)`. If not, it had the one that is there now, and no pixel has changed.
     pub(crate) fn log_ratio(self, usual: f64) -> f64 {
-        let Self { change, looks, .. } = self;
-        // k / 2 (r - 1 - ln r): likelihood ratio of k looks with r times their expected variance.
-        let changed = if change > 1.0 { looks / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
+        let Self { change, samples, .. } = self;
+        // k / 2 (r - 1 - ln r): likelihood ratio of k samples with r times their expected variance.
+        let changed = if change > 1.0 { samples / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
         (self.contrast_log_ratio(usual, UNCHANGED) + changed.min(MOST)).clamp(-MOST, MOST)
     }
 
     /// The same ratio against something that lies on the lens, or is written into the video: the
-    /// scene behind it has changed, so that changed pixels tell nothing.
+    /// scene behind it has changed, so that changed pixels say nothing.
     pub(crate) fn on_lens_log_ratio(self, usual: f64) -> f64 {
         self.contrast_log_ratio(usual, BEHIND * usual).clamp(-MOST, MOST)
     }
@@ -147,11 +148,6 @@ impl ComparisonBuffers {
             View { x: then.x, y: then.y, scale: 1.0, turn_rad: 0.0 },
             &mut self.before,
         );
-        // Pixels under the reference where the target was seen in the picture, and one pixel about
-        // it.
-        let covered = |at: usize, side: usize, then: f64, seen: f64| {
-            (then + at as f64 - (side as f64 - 1.0) / 2.0 - seen).abs() <= side as f64 / 2.0 + 1.0
-        };
         let mut sums = PixelSums::default();
         for y in 0..height {
             let row_covered = seen.is_some_and(|seen| covered(y, height, then.y, seen.y));
@@ -170,6 +166,12 @@ impl ComparisonBuffers {
         }
         sums.arrival(energy, noise)
     }
+}
+
+/// Whether the reference's row or column `at`, with its middle at `then`, is under the target where
+/// it was `seen` in the picture, or within a pixel of that.
+fn covered(at: usize, side: usize, then: f64, seen: f64) -> bool {
+    (then + at as f64 - (side as f64 - 1.0) / 2.0 - seen).abs() <= side as f64 / 2.0 + 1.0
 }
 
 /// Sums over the pixels that count.
@@ -242,7 +244,7 @@ impl PixelSums {
             // Var(a / E) = v E / E^2.
             variance: noise / energy,
             change: self.change_squared() / n / unchanged,
-            looks: (n / PIXELS_A_LOOK).min(MOST_LOOKS),
+            samples: (n / PIXELS_PER_SAMPLE).min(MOST_SAMPLES),
         })
     }
 }

@@ -4,8 +4,8 @@
 //! long as the reference is noisy the places at which it learns wander away from the target's
 //! middle. The mean of many images has a fraction of their noise, and the scene behind a moving
 //! target averages out of it. (Behind one that hovers it does not: two things stand out then, and
-//! the reference stays.) So, until the first appearance is clear of noise, the figure is looked for
-//! in that mean; where it stands beside the middle of the reference, the reference is cut out anew
+//! the reference stays.) Until the first appearance is clear of noise, the figure is looked for
+//! in that mean; where it stands beside the middle of the reference, the reference is cut out again
 //! about it.
 
 use crossfix_correlation::View;
@@ -16,7 +16,7 @@ use crate::figure::is_centred;
 use crate::frame::FrameInput;
 use crate::scratch::Scratch;
 use crate::state::{CUT_OUT_SHAPE, TargetBelief};
-use crate::surroundings::{FIRST_LOOK, Surroundings};
+use crate::surroundings::{FIRST_SEARCH_IMAGES, Surroundings};
 use crate::tracker_part::TrackerPart;
 use crate::{ImagePoint, PixelBox, ReferenceStrategy, TrackerConfig};
 
@@ -36,16 +36,16 @@ impl TargetBelief {
         }
     }
 
-    /// Begins the mean anew, if there is one: what it shows was perhaps not the target.
+    /// Begins the mean again, if there is one: what it shows was perhaps not the target.
     pub(crate) fn forget_surroundings(&mut self) {
         if let Some(surroundings) = self.surroundings.as_deref_mut() {
-            (surroundings.images, surroundings.next_look) = (0.0, FIRST_LOOK);
+            (surroundings.images, surroundings.next_search_images) = (0.0, FIRST_SEARCH_IMAGES);
         }
     }
 
     /// Takes an image that shows the target at `place` with probability `certainty` into the mean,
     /// and looks for the figure there if it is time. Returns whether the reference has been cut out
-    /// anew about another middle.
+    /// again about another middle.
     pub(crate) fn centre(
         &mut self,
         frame: FrameInput<'_>,
@@ -62,20 +62,20 @@ impl TargetBelief {
         replace_invalid(view);
         surroundings.take_in(view, self.noise * noise_kept(place), certainty);
         let is_last = !self.appearance.is_anchor_noisy();
-        let is_time = is_last || surroundings.images >= surroundings.next_look;
+        let is_time = is_last || surroundings.images >= surroundings.next_search_images;
         let mut has_moved = false;
-        if is_time && surroundings.images >= FIRST_LOOK {
-            surroundings.next_look *= 2.0;
+        if is_time && surroundings.images >= FIRST_SEARCH_IMAGES {
+            surroundings.next_search_images *= 2.0;
             let [width, height] = self.appearance.sides();
             let about = PixelBox::about(surroundings.middle(), width, height);
             if let Some(figure) = surroundings.figure(about, config) {
-                let anew = PixelBox::about(figure.centre(), width, height);
+                let centred = PixelBox::about(figure.centre(), width, height);
                 has_moved =
-                    !is_centred(about, figure) && surroundings.holds(anew, config.margin_px);
+                    !is_centred(about, figure) && surroundings.holds(centred, config.margin_px);
                 if has_moved {
-                    self.cut_out(anew, &surroundings, scratch, config);
+                    self.cut_out(centred, &surroundings, scratch, config);
                 }
-                // The next look is at new images.
+                // The next search is in new images.
                 surroundings.images = 0.0;
             }
         }
@@ -83,7 +83,7 @@ impl TargetBelief {
         has_moved
     }
 
-    /// Cuts the reference out of the mean anew, in a box there.
+    /// Cuts the reference out of the mean, in a box there.
     fn cut_out(
         &mut self,
         about: PixelBox,

@@ -13,9 +13,10 @@ use crate::state::TargetBelief;
 
 /// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few
 /// milliseconds then; with 8 it takes three times as long and finds no more, with 3 it finds what
-/// looks like the target from afar. And the most pixels per side that are averaged into one. With
-/// half of these the search for a large target has four times as many places.
+/// looks like the target from afar.
 const COARSE_SIDE: usize = 5;
+/// Most pixels per side that are averaged into one. With half of it the search for a large target
+/// has four times as many places.
 const MOST_COARSE: usize = 4;
 /// Number of places by which the scene's contrasts are known: their median to a few hundredths.
 /// With half of it a search is not noticeably quicker.

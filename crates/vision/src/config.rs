@@ -309,7 +309,8 @@ impl TrackerConfig {
             )?;
         }
         if self.paper.whole_gate && self.paper.extent == Extent::Linear {
-            let must = "false where the extent is linear: a reference as large as the gate has one place in it";
+            let must = "false where the extent is linear: a reference as large as the gate has one \
+                        place in it";
             check("paper.whole_gate", 1.0, false, must)?;
         }
         Ok(())

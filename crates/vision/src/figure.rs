@@ -11,13 +11,15 @@ use crate::crop::replace_invalid;
 use crate::noise::{OF_MEDIAN, median};
 use crate::{ImagePoint, PixelBox};
 
-/// The figure ends where it stands out by less than this share of its highest pixel (its top) ...
+/// The figure ends where it stands out by less than this share of its highest pixel (its top), or
+/// by less than [`ABOVE_GROUND`]. With half of it the blur about a thing is part of it.
 const SHARE_OF_TOP: f32 = 0.3;
-/// ... or by less than this many standard deviations of the ground; but this threshold is at most
-/// half of the top. With half of the first the blur about a thing is part of it; with half of the
-/// second one pixel of the ground in twenty is, and figures run on to the border; with half of the
-/// third a faint figure ends in the ground.
+/// The figure ends where it stands out by less than this many standard deviations of the ground.
+/// With half of it one pixel of the ground in twenty is part of it, and figures run on to the
+/// border.
 const ABOVE_GROUND: f32 = 4.0;
+/// The threshold at which the figure ends is at most this share of the top. With half of it a faint
+/// figure ends in the ground.
 const MOST_OF_TOP: f32 = 0.5;
 /// Gap over which parts count as one thing, as a share of the longer side: rotors, legs and the
 /// body. With half of it rotors count as other things than the body, with twice as much two birds
@@ -42,14 +44,13 @@ const GROUND_PX: f64 = 2.0;
 /// moved by noise, with twice as much only boxes on what the eye sees at once are corrected.
 const LEAST_TOP: f32 = 9.0;
 /// ... and if at least this share of all that stands out is the figure's own: else nobody knows
-/// which of two things was meant. With half of it the larger of two like things is taken.
+/// which of two things was meant. With half of it the larger of two like things is chosen.
 const LEAST_SHARE: f32 = 0.8;
 /// A box is right as it is if neither it nor its figure is shorter than this share of the other, on
-/// both axes, ...
+/// both axes (with half of it a box three times as large as its target is kept), ...
 const LEAST_FILLED: f64 = 0.6;
 /// ... and if their middles are apart by at most this share of the box's side, and a pixel: figures
-/// are known no better. With half of the first a box three times as large as its target is kept;
-/// with half of the second one of 20 px is moved for 2.5 px instead of 4.
+/// are known no better. With half of it a box of 20 px is moved for 2.5 px instead of 4.
 const MOST_OFF: f64 = 0.15;
 
 /// A connected part of a window: its corners, the middle of its weights, and their sum.
@@ -119,7 +120,7 @@ fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Optio
     let mut weights: Vec<f32> = off.samples().iter().map(weight).collect();
     let (mut low, mut high) = (seed, seed);
     let (mut sum, mut moments) = (0.0, [0.0; 2]);
-    // Flood fill: a pixel's weight is set to 0 when it is taken.
+    // Flood fill: a pixel's weight is set to 0 when it is counted.
     let mut stack = vec![(seed, std::mem::take(&mut weights[seed[1] * width + seed[0]]))];
     while let Some(([x, y], weight)) = stack.pop() {
         if x.min(y) == 0 || x == width - 1 || y == height - 1 {
@@ -287,9 +288,8 @@ fn figure_within(
     let level = |[x, y]: [usize; 2]| off.row(y)[x];
     let places = (0..off.height()).flat_map(|y| (0..off.width()).map(move |x| [x, y]));
     // The seed of the figure is the pixel with the largest product of prominence and probability.
-    let score = |[x, y]: [usize; 2]| {
-        level([x, y]) * likely_meant(given, given_sd, [ranges[0].start + x, ranges[1].start + y])
-    };
+    let in_image = |[x, y]: [usize; 2]| [ranges[0].start + x, ranges[1].start + y];
+    let score = |at: [usize; 2]| level(at) * likely_meant(given, given_sd, in_image(at));
     let seed = places.max_by(|one, other| score(*one).total_cmp(&score(*other)))?;
     let top = level(seed);
     if top < LEAST_TOP * spread {

@@ -7,7 +7,7 @@ use crossfix_message::Timestamp;
 use crate::config::Algorithm;
 use crate::detector::{Detector, Found, KnownTarget};
 use crate::figure::meant;
-use crate::followed::{Followed, Follower, Origin, box_of, describe};
+use crate::followed::{Followed, Follower, TakenUpBy, box_of, describe};
 use crate::frame::{FrameInput, TargetStep};
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
@@ -16,15 +16,16 @@ use crate::{
 
 /// Most candidates, things that are followed because they may be a lost target: each costs as much
 /// as a target. With 20 an image of a panning camera takes up to 42 ms instead of 14, and no more
-/// is found.
+/// is found; with half of it a lost target among others that move has a stand-in less often.
 const MOST_CANDIDATES: usize = 6;
 /// A candidate is shown in a lost target's place after this long, s: as long as what a search has
 /// found is on probation. With half of it half a percent more of a still camera's frames are right,
 /// and as many fewer of a panning one's.
 const CANDIDATE_S: f64 = 0.5;
-/// For this long after it was given a target may be taken up anew where it shows, s: a video's
+/// For this long after it was given a target may be taken up again where it shows, s: a video's
 /// compression hides a bird of five pixels for some images. Longer, and something else may
-/// have flown into the box by then (reasoned, not measured).
+/// have flown into the box by then; with half of it one that compression hides for longer is not
+/// put right (reasoned, not measured).
 const SHOWN_WITHIN_S: f64 = 0.5;
 /// Largest ratio of a candidate's mean side to the target's, either way: of a drone before trees
 /// only the brightest part is found. With half of it a part of less than a quarter of its area
@@ -44,7 +45,7 @@ impl ImageTracker {
         self.take_up_late(image, time);
         for given in given {
             let meant = self.meant(image, given);
-            self.take_up_at(image, meant.unwrap_or(given), Origin::Given, time);
+            self.take_up_at(image, meant.unwrap_or(given), TakenUpBy::Given, time);
             if let Some(followed) = self.followed.last_mut() {
                 followed.unshown = meant.is_none().then_some(given);
             }
@@ -76,7 +77,7 @@ impl ImageTracker {
         }
         let Found { place, gone_px } = found;
         let is_candidate = self.config.detector.is_none();
-        let origin = Origin::Detected {
+        let origin = TakenUpBy::Detected {
             first: place.centre(),
             turned: self.scene.turned(),
             // A candidate has to show by itself that it moves.
@@ -86,14 +87,14 @@ impl ImageTracker {
         self.take_up_at(image, place, origin, time);
     }
 
-    fn take_up_at(&mut self, image: &Plane, place: PixelBox, origin: Origin, time: Timestamp) {
-        let is_candidate = matches!(origin, Origin::Detected { is_candidate: true, .. });
+    fn take_up_at(&mut self, image: &Plane, place: PixelBox, origin: TakenUpBy, time: Timestamp) {
+        let is_candidate = matches!(origin, TakenUpBy::Detected { is_candidate: true, .. });
         let id = if is_candidate { &mut self.next_candidate } else { &mut self.next_id };
         let number = *id;
         *id = if is_candidate { number - 1 } else { number + 1 };
         let id = ImageTrackId(number);
         let mut target = Follower::new(image, place, &mut self.scratch, &self.config);
-        if origin == Origin::Given {
+        if origin == TakenUpBy::Given {
             target.begin_centring(&self.config);
         }
         let step = TargetStep { measured: None, score: 1.0, certainty: 1.0, nis: None };
@@ -115,7 +116,7 @@ impl ImageTracker {
     fn show_stand_ins(&mut self, time: Timestamp) {
         for lost in 0..self.followed.len() {
             let followed = &self.followed[lost];
-            let is_lost = followed.origin == Origin::Given && followed.target.is_searching();
+            let is_lost = followed.origin == TakenUpBy::Given && followed.target.is_searching();
             let stand_in = if is_lost { self.stand_in_of(followed, time) } else { None };
             self.followed[lost].stand_in = stand_in;
             let track = |id| self.tracks.iter().position(|track| track.id == id);
@@ -157,7 +158,7 @@ impl ImageTracker {
             && self.followed.iter().all(|other| other.stand_in != Some(followed.id))
     }
 
-    /// Takes up anew what was given by a box in which nothing stood out, if it is not seen and
+    /// Takes up again what was given by a box in which nothing stood out, if it is not seen and
     /// something stands out there now.
     fn take_up_late(&mut self, image: &Plane, time: Timestamp) {
         for index in 0..self.followed.len() {
@@ -221,7 +222,7 @@ impl ImageTracker {
             let place = box_of(&followed.target);
             let (at, side) = (place.centre(), place.width.max(place.height));
             // Nobody knows where a lost target is.
-            if let Origin::Detected { first, turned: then, has_moved, .. } = &mut followed.origin
+            if let TakenUpBy::Detected { first, turned: then, has_moved, .. } = &mut followed.origin
                 && followed.target.is_seen()
             {
                 let gone = [at.x - first.x, at.y - first.y];

@@ -18,10 +18,10 @@ const LEAST_MEASUREMENT_SD: f64 = 0.005;
 /// the target. They change together over connected parts of this many pixels, and so displace the
 /// fit like noise of this many times their variance. With half of it a target behind branches
 /// promises 0.7 of the standard deviation that it should.
-const PIXELS_A_PART: f64 = 10.0;
+const PIXELS_PER_PART: f64 = 10.0;
 
 /// Largest standard deviation of a measurement, px: a place measured no better is unknown, and gets
-/// this one. With half of it the same: 500 px tell nothing either.
+/// this one. With half of it the same: 500 px say nothing either.
 const MOST_MEASUREMENT_SD: f64 = 1e3;
 
 /// A reference fitted to the image at the best placement.
@@ -31,10 +31,17 @@ pub(crate) struct TargetFit {
     pub(crate) covariance: Matrix2<f64>,
     /// The target's contrast, as a multiple of the reference's.
     pub(crate) contrast: f64,
-    /// Change of log scale and of turn (rad), each with its variance.
-    pub(crate) shape: Option<[(f64, f64); 2]>,
+    /// Change of log scale, and of turn (rad).
+    pub(crate) shape: Option<[ShapeChange; 2]>,
     /// Correlation coefficient, with the noise taken out.
     pub(crate) score: f64,
+}
+
+/// A measured change of a target's size or direction.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ShapeChange {
+    pub(crate) change: f64,
+    pub(crate) variance: f64,
 }
 
 impl TargetFit {
@@ -67,11 +74,12 @@ impl TargetBelief {
         let (pixels, image_noise) = (fit.pixels as f64, f64::from(self.noise));
         let least_contrast = 0.1 * self.contrast * f64::from(self.appearance.clear_share());
         let contrast = fit.gain.max(least_contrast);
-        let expected =
-            f64::from(self.appearance.noise() + self.appearance.taken()) * contrast * contrast;
+        let expected = f64::from(self.appearance.noise() + self.appearance.filtered_out())
+            * contrast
+            * contrast;
         let explained = image_noise * (1.0 + 2.0 * (2.0 / pixels).sqrt());
         let unexplained = (fit.residual_variance - explained - expected).max(0.0);
-        let noise = image_noise + PIXELS_A_PART * unexplained;
+        let noise = image_noise + PIXELS_PER_PART * unexplained;
         let covariance = self.covariance(&fit, self.motion.noise_factor() * noise, contrast);
         // The reference may have drifted off its anchor meanwhile.
         let drift = self.appearance.in_image(self.appearance.drift);
@@ -81,7 +89,10 @@ impl TargetBelief {
         let scaled = noise * (fit.gain / contrast).powi(2);
         let Drift { log_scale, turn_rad, .. } = self.appearance.drift;
         let shape = fit.shape_variances(scaled).map(|[scale, turn]| {
-            [(fit.log_scale + log_scale, scale), (fit.turn_rad + turn_rad, turn)]
+            [
+                ShapeChange { change: fit.log_scale + log_scale, variance: scale },
+                ShapeChange { change: fit.turn_rad + turn_rad, variance: turn },
+            ]
         });
         // Correlation coefficient sqrt(signal / (signal + rest)), the rest being neither signal nor
         // noise.

@@ -5,7 +5,7 @@ use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
-use crate::followed_target::Target;
+use crate::followed_target::ImageTarget;
 use crate::frame::{FrameInput, TargetStep};
 use crate::paper::PaperTarget;
 use crate::scratch::Scratch;
@@ -13,7 +13,7 @@ use crate::{ImagePoint, ImageTrack, ImageTrackId, PixelBox, TrackPhase, TrackerC
 
 /// Who took a target up.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Origin {
+pub(crate) enum TakenUpBy {
     /// A person or a configuration: it is never given up.
     Given,
     /// The detector.
@@ -34,7 +34,7 @@ pub(crate) enum Origin {
 /// A target as one of the algorithms follows it.
 #[derive(Debug)]
 pub(crate) enum Follower {
-    Posterior(Box<Target>),
+    Posterior(Box<ImageTarget>),
     Paper(Box<PaperTarget>),
 }
 
@@ -47,7 +47,7 @@ impl Follower {
     ) -> Self {
         match config.algorithm {
             Algorithm::Posterior => {
-                Self::Posterior(Box::new(Target::new(image, place, scratch, config)))
+                Self::Posterior(Box::new(ImageTarget::new(image, place, scratch, config)))
             }
             Algorithm::Paper => Self::Paper(Box::new(PaperTarget::new(image, place, config))),
         }
@@ -124,12 +124,12 @@ impl Follower {
 #[derive(Debug)]
 pub(crate) struct Followed {
     pub(crate) id: ImageTrackId,
-    pub(crate) origin: Origin,
+    pub(crate) origin: TakenUpBy,
     pub(crate) target: Follower,
     pub(crate) measured_at: Timestamp,
     /// When it was last searched for.
     pub(crate) searched: Option<Timestamp>,
-    /// Its place in the next image, if somebody has told it.
+    /// Its place in the next image, if somebody has given it.
     pub(crate) cue: Option<ImagePoint>,
     /// Since when it has been followed.
     pub(crate) since: Timestamp,
@@ -141,12 +141,12 @@ pub(crate) struct Followed {
 
 impl Followed {
     pub(crate) fn is_candidate(&self) -> bool {
-        matches!(self.origin, Origin::Detected { is_candidate: true, .. })
+        matches!(self.origin, TakenUpBy::Detected { is_candidate: true, .. })
     }
 
     /// Whether it was found by the detector, and has been elsewhere since.
     pub(crate) fn has_moved(&self) -> bool {
-        matches!(self.origin, Origin::Detected { has_moved: true, .. })
+        matches!(self.origin, TakenUpBy::Detected { has_moved: true, .. })
     }
 }
 

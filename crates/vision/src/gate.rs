@@ -48,6 +48,19 @@ impl Region {
     }
 }
 
+impl GateRule {
+    /// Standard deviations of the innovation that a gate must reach beyond its middle.
+    fn sigmas(self) -> f64 {
+        match self {
+            Self::ThreeSided => 0.0,
+            Self::Innovation { sigmas } => sigmas,
+            Self::Ellipsoid { probability } => {
+                Gate::with_probability(probability).threshold().sqrt()
+            }
+        }
+    }
+}
+
 impl TargetBelief {
     /// Half sides of the gate (Herasymenko 2021, section 1; Lytvynets 2020, eq. 5.12): how far from
     /// the prediction the reference is placed.
@@ -55,15 +68,9 @@ impl TargetBelief {
         let reference = self.appearance.working.image();
         let expected = self.motion.found();
         let sides = [(reference.width(), image.width()), (reference.height(), image.height())];
+        let sigmas = config.gate.sigmas();
         [0, 1].map(|i| {
             let (side, most) = sides[i];
-            let sigmas = match config.gate {
-                GateRule::ThreeSided => 0.0,
-                GateRule::Innovation { sigmas } => sigmas,
-                GateRule::Ellipsoid { probability } => {
-                    Gate::with_probability(probability).threshold().sqrt()
-                }
-            };
             let spread = (sigmas * expected[i].variance.sqrt()).ceil();
             (side as f64).max(spread).min(most as f64) as usize
         })

@@ -16,11 +16,13 @@ use crate::state::TargetBelief;
 
 /// Certainty of the best place below which the other places are kept too. With 0.8 another place is
 /// dropped that is right up to once in five times; with 0.95 more images cost several posteriors.
-pub(crate) const DOUBT: f64 = 0.9;
-/// Most hypotheses that are kept, and most places in an image that each of them may go to. With
-/// half of either the right one of several like places is dropped sooner; each that is kept costs a
-/// posterior per image.
+/// With half of it the other places are never kept, as the best one mostly has more.
+pub(crate) const ONE_PLACE: f64 = 0.9;
+/// Most hypotheses that are kept. With half of it the right one of several like places is dropped
+/// sooner; each that is kept costs a posterior per image.
 const MOST: usize = 12;
+/// Most places in an image that each hypothesis may go to. With half of it the third of several
+/// like places, which may be the right one, is dropped at once.
 const MOST_PEAKS: usize = 4;
 /// A place with less than this share of its hypothesis is dropped, and a hypothesis of less weight
 /// than this. With half of it more are kept, at the cost of a posterior each; with twice as much
@@ -33,11 +35,12 @@ const SAME: f64 = 2.0;
 /// filters are restarted there. With half of it one right place in 55 loses its velocity, instead
 /// of one in 3000.
 const UNEXPECTED: f64 = 16.0;
-/// A target counts as lost when no place has been sure for this long, s, ...
+/// A target counts as lost when no place has been sure for this long, s. With half of it doubts of
+/// a fifth of a second are shown as losses.
 const LOST_S: f64 = 0.4;
-/// ... and is searched for after this long, s: as a cloud passes it is fainter than noise for a
-/// second. With a fifth of it 2.9 % of the frames of nine seeds' sequences are lost instead of 2.3,
-/// with twice as much 2.4. With half of `LOST_S` doubts of a fifth of a second are shown as losses.
+/// A target is searched for when no place has been sure for this long, s: as a cloud passes it is
+/// fainter than noise for a second. With a fifth of it 2.9 % of the frames of nine seeds' sequences
+/// are lost instead of 2.3, with twice as much 2.4.
 const LONGEST_S: f64 = 2.0;
 
 /// A place where the target may be, with the filters of its motion.
@@ -52,7 +55,7 @@ pub(crate) struct PlaceHypothesis {
 }
 
 impl PlaceHypothesis {
-    /// The hypothesis of a target whose place is not in doubt yet.
+    /// The hypothesis of a target that has had only one place so far.
     fn of(state: &TargetBelief) -> Self {
         Self { weight: 1.0, motion: state.motion.clone(), hidden: state.hidden, peak: None }
     }
@@ -60,6 +63,11 @@ impl PlaceHypothesis {
     fn at(&self) -> [f64; 2] {
         let ImagePoint { x, y } = self.motion.position();
         [x, y]
+    }
+
+    /// Whether it has been seen in this image near a placement.
+    fn is_seen_near(&self, [column, row]: [usize; 2], near: [usize; 2]) -> bool {
+        self.peak.is_some_and(|[x, y]| x.abs_diff(column) <= near[0] && y.abs_diff(row) <= near[1])
     }
 
     /// Whether two hypotheses agree in place and velocity. One that has been seen and one that has
@@ -71,11 +79,11 @@ impl PlaceHypothesis {
         let near = |off: f64, variance: f64| off.abs() < SAME * variance.sqrt();
         // |x1 - x2| < 2 max(s1, s2) on both axes, in place and in velocity.
         let faster = [one.x - two.x, one.y - two.y];
-        let alike = (0..2).all(|i| {
+        let agree = (0..2).all(|i| {
             near(here[i].position - there[i].position, here[i].variance.max(there[i].variance))
                 && near(faster[i], a[i].m22.max(b[i].m22))
         });
-        alike && self.peak.is_some() == other.peak.is_some()
+        agree && self.peak.is_some() == other.peak.is_some()
     }
 }
 
@@ -84,28 +92,28 @@ impl PlaceHypothesis {
 pub(crate) struct PlaceHypotheses {
     all: Vec<PlaceHypothesis>,
     /// How long no place has been sure, s.
-    doubted_s: f64,
+    unsure_s: f64,
 }
 
 impl PlaceHypotheses {
     pub(crate) fn clear(&mut self) {
         self.all.clear();
-        self.doubted_s = 0.0;
+        self.unsure_s = 0.0;
     }
 
     /// Counts one more image in which no place was sure.
-    pub(crate) fn note_doubt(&mut self, interval: f64) {
-        self.doubted_s += interval;
+    pub(crate) fn note_unsure(&mut self, interval: f64) {
+        self.unsure_s += interval;
     }
 
-    /// Whether no place has been sure for so long that the target must be searched for.
+    /// Whether no place has been sure for too long, so that the target must be searched for.
     pub(crate) fn are_hopeless(&self) -> bool {
-        self.doubted_s > LONGEST_S
+        self.unsure_s > LONGEST_S
     }
 
-    /// Whether no place has been sure for so long that the target counts as lost.
-    pub(crate) fn are_doubted(&self) -> bool {
-        self.doubted_s > LOST_S
+    /// Whether no place has been sure for long enough that the target counts as lost.
+    pub(crate) fn are_lost(&self) -> bool {
+        self.unsure_s > LOST_S
     }
 
     pub(crate) fn is_empty(&self) -> bool {
@@ -165,11 +173,8 @@ impl PlaceHypotheses {
     }
 
     /// Total weight of the hypotheses that have been seen near a placement in this image.
-    pub(crate) fn share_near(&self, [column, row]: [usize; 2], near: [usize; 2]) -> f64 {
-        let here = |h: &&PlaceHypothesis| {
-            h.peak.is_some_and(|[x, y]| x.abs_diff(column) <= near[0] && y.abs_diff(row) <= near[1])
-        };
-        self.all.iter().filter(here).map(|h| h.weight).sum()
+    pub(crate) fn share_near(&self, placement: [usize; 2], near: [usize; 2]) -> f64 {
+        self.all.iter().filter(|h| h.is_seen_near(placement, near)).map(|h| h.weight).sum()
     }
 
     /// Advances every hypothesis into the image whose log likelihood ratios are in
@@ -216,7 +221,7 @@ impl PlaceHypotheses {
         let there: f64 =
             ways.iter().filter(|(.., way)| here(way.peak)).map(|(mass, ..)| mass).sum();
         // Several hypotheses may lead to one place: their masses there count together.
-        (there > DOUBT * all).then(|| (self.all[best].motion.clone(), posterior))
+        (there > ONE_PLACE * all).then(|| (self.all[best].motion.clone(), posterior))
     }
 
     /// The successors of all hypotheses, with their weights: for each hypothesis one that is not

@@ -15,11 +15,13 @@ use crate::tracker_part::TrackerPart;
 /// a mistake costs what is known of where it went, and nothing is learnt of it. With half of it a
 /// mistake is learnt after a quarter of a second.
 const PROBATION_S: f64 = 0.5;
-/// Rate at which the scene takes the place of a target that is followed, 1/s, and rate at which
-/// that ends. With ten times the first, certainty falls where nothing is known against the target;
-/// with a tenth, a cloud is followed for seconds. With half of the second a target doubted by
-/// mistake counts as seen again after 0.7 s instead of 0.35, where nothing more is known.
+/// Rate at which the scene takes the place of a target that is followed, 1/s. With ten times as
+/// much, certainty falls where nothing is known against the target; with a tenth, a cloud is
+/// followed for seconds.
 const GOES_PER_S: f64 = 0.1;
+/// Rate at which a target takes its place back from the scene, 1/s. With half of it a target taken
+/// for the scene by mistake counts as seen again after 0.7 s instead of 0.35, where nothing more is
+/// known.
 const COMES_PER_S: f64 = 2.0;
 /// Probability that what a search has found is the target: the search has asked more of it than is
 /// asked of what is followed. With half of it nothing that is found would count as seen before the
@@ -34,14 +36,15 @@ const CONTRAST_SD: f64 = 0.3;
 /// deviation of a placement hardly counts as noise.
 const BEST_SD: f64 = 0.5;
 /// Least share of the reference that must be the target's: with less, nobody knows the usual
-/// contrast.
+/// contrast. With half of it a reference of half noise is compared too, whose contrast is off by as
+/// much.
 const CLEAR: f64 = 0.9;
-/// Most that one image tells by its contrast, log likelihood ratio: noise may be other than white.
-/// With half of it a target that has become noise is doubted after four images instead of two, at
-/// 30 per second, where nothing else is known.
+/// Most that one image counts by its contrast, log likelihood ratio: noise may be other than white.
+/// With half of it a target that has become noise counts as unseen after four images instead of
+/// two, at 30 per second, where nothing else is known.
 const MOST: f64 = 2.0;
-/// Images that are closer together than this tell no more than one, s: blur and compression last
-/// from one to the next. With half of it sixty images a second tell twice as much as thirty.
+/// Images that are closer together than this count as no more than one, s: blur and compression
+/// last from one to the next. With half of it sixty images a second count twice as much as thirty.
 const NEWS_S: f64 = 1.0 / 30.0;
 /// Number of the scene's pictures in which a target remembers its place: more than there are. With
 /// half of it the same.
@@ -49,7 +52,7 @@ const MOST_PICTURES: usize = 16;
 
 /// Belief that what is followed is the target.
 #[derive(Clone, Debug)]
-pub(crate) struct Identity {
+pub(crate) struct TargetIdentity {
     /// Probability that it is the target.
     probability: f64,
     /// Places of the target in the scene's pictures, by the pictures' numbers.
@@ -76,7 +79,7 @@ struct Probation {
     seen_s: f64,
 }
 
-impl Identity {
+impl TargetIdentity {
     /// Identity of a target that somebody has shown.
     pub(crate) fn new() -> Self {
         Self {
@@ -114,7 +117,7 @@ impl Identity {
 
     /// Notes its place when a picture of the scene was taken, if it was seen.
     pub(crate) fn note_picture(&mut self, state: &TargetBelief, number: u64) {
-        // While it is in doubt, its place is not known.
+        // While it is unseen, its place is not known.
         if state.unseen_s > 0.0 {
             return;
         }
@@ -129,7 +132,7 @@ impl Identity {
     }
 
     /// Log-likelihood ratio that the target has come to a place, against that what is there now was
-    /// there before: by the first picture of the scene that tells, and by the first that shows
+    /// there before: by the first picture of the scene that shows it, and by the first that shows
     /// whether the thing turns with the camera; 0 if none does.
     ///
     /// In a picture that was taken while it was lost, the target is taken to have been elsewhere if
@@ -161,7 +164,7 @@ impl Identity {
         let mut against = |picture: &ScenePicture, then: ImagePoint| {
             let seen = self.place_in(picture);
             let has_moved_on = speed * picture.age_s() > longest;
-            // A picture tells only if the target was elsewhere in it: at a place that is known, or
+            // A picture counts only if the target was elsewhere in it: at a place that is known, or
             // lost and gone on since.
             if seen.is_none() && !(self.was_lost(state, picture) && has_moved_on) {
                 return None;
@@ -199,17 +202,17 @@ impl Identity {
         (place.x + turned[0] - x).hypot(place.y + turned[1] - y) / lost_s.max(frame.interval)
     }
 
-    /// Probability that what is followed is the target and neither the scene nor noise: a Markov
-    /// chain of two states. It is updated with whether what is at the place has come there, and
-    /// whether that stands out as the target does.
-    pub(crate) fn doubt(
+    /// Updates the probability that what is followed is the target and neither the scene nor noise,
+    /// and returns it: a Markov chain of two states, updated with whether what is at the place has
+    /// come there, and whether that stands out as the target does.
+    pub(crate) fn measurement_update(
         &mut self,
         state: &TargetBelief,
         frame: FrameInput<'_>,
         fit: TargetFit,
         scratch: &mut Scratch,
     ) -> f64 {
-        // Images that follow each other sooner tell no more than one would.
+        // Images that follow each other sooner count as no more than one.
         let share = (frame.interval / NEWS_S).min(1.0);
         let placements = scratch.ratios.samples().len() as f64;
         let above_noise = if frame.config.has(TrackerPart::UsualContrast) {
@@ -272,7 +275,7 @@ impl Identity {
 }
 
 /// Log-likelihood ratio of a contrast being the target's, whose usual one is known, against it
-/// being the largest of so many placements' in noise.
+/// being the largest of a number of placements' in noise.
 fn above_noise_log_ratio(state: &TargetBelief, contrast: f64, placements: f64) -> f64 {
     let deviation =
         f64::from(state.noise / state.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();

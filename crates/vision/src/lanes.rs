@@ -7,7 +7,8 @@ use std::ops::{Add, Div, Mul, Sub};
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0) * std::f32::consts::LOG2_E;
-    // Adding and subtracting 1.5 2^23 rounds to a whole number.
+    /// Adding and subtracting 1.5 2^23 rounds to a whole number: there a single-precision number
+    /// has no fraction. With half of it halves would be left.
     const ROUND: f32 = 12_582_912.0;
     let whole = (x + ROUND) - ROUND;
     let t = (x - whole) * std::f32::consts::LN_2;
@@ -33,7 +34,8 @@ pub(crate) fn ln(x: f32) -> f32 {
     exponent as f32 * std::f32::consts::LN_2 + series
 }
 
-/// Number of values that are computed together.
+/// Number of values that are computed together: those of a 256-bit register. With half of it half
+/// the register is idle.
 pub(crate) const LANES: usize = 8;
 
 /// The greatest of some numbers; minus infinity of none. Those that are not numbers are left out.

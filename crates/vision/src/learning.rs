@@ -1,7 +1,7 @@
 //! What is learnt of a target from an image: its contrast, size, direction and appearance.
 
 use crate::ImagePoint;
-use crate::fit::TargetFit;
+use crate::fit::{ShapeChange, TargetFit};
 use crate::frame::FrameInput;
 use crate::scratch::Scratch;
 use crate::state::{SEEN, TargetBelief};
@@ -18,7 +18,8 @@ const FADES_S: f64 = 0.5;
 /// it is learned fully. A target changes its looks by little from image to image; an image that
 /// suddenly matches worse has something else in it, a mast or a bird. With a first of 0.5 a
 /// reference learns the mast that it passes: on drawn scenes of masts 11 % of the frames are lost
-/// instead of 7 (both without what is learnt anyway).
+/// instead of 7 (both without what is learnt anyway). With half of both hardly an image is learned
+/// less than fully, and masts are learned sooner still.
 const LEARNING_MATCHES: [f64; 2] = [0.7, 0.95];
 /// Share with which such an image is learned all the same: it may be the target that has changed.
 /// With half of it two of 24 drawn targets that turn from bright to dark within two seconds are
@@ -32,11 +33,13 @@ const USUAL_MATCH_S: f64 = 1.0;
 /// weighed in. With half of them hardly anything changes: the certainty is the weight of what is
 /// learnt.
 const LEAST_CERTAINTY: [f64; 2] = [0.05, 0.02];
-/// Random walk of the contrast, as a share of it per root second, and the floor of its
-/// measurement's standard deviation. In little noise the gain is 0.73 at thirty images a second;
-/// with half of the first it is 0.5, and the contrast lags an image behind a cloud's edge; with
-/// half of the second it is 0.9, and follows every misfit.
+/// Random walk of the contrast, as a share of it per root second. In little noise the gain is 0.73
+/// at thirty images a second; with half of it the gain is 0.5, and the contrast lags an image
+/// behind a cloud's edge.
 const CONTRAST_WALK: f64 = 0.767;
+/// Floor of the standard deviation of a measured contrast, as a multiple of the reference's: what
+/// the reference does not model. With half of it the gain is 0.9, and the contrast follows every
+/// misfit.
 const CONTRAST_FLOOR: f64 = 0.1;
 /// Floor of the standard deviation of a measured log scale or turn. With half of it the gain of the
 /// scale is 0.21 instead of 0.11, and the size follows every misfit.
@@ -124,7 +127,7 @@ impl TargetBelief {
         let limits = [0.2, 0.5];
         let mut steps = [0.0; 2];
         for i in 0..2 {
-            let (change, variance) = shape[i];
+            let ShapeChange { change, variance } = shape[i];
             // A change that is badly known or too large for one image is a misfit, not a change of
             // shape.
             if variance < 0.1 && change.abs() < limits[i] {

@@ -19,10 +19,12 @@ use nalgebra::{Matrix2, Matrix3, Vector3};
 use self::axis::{AxisMotion, OFFSET, POSITION, VELOCITY};
 use crate::ImagePoint;
 
+/// Number of motion models: each costs a filter per axis. With half of it the lively and the still
+/// one are left, and a target of a motion between has a filter that is five times off.
 const WAYS: usize = 4;
 /// Standard deviation of each motion model's white acceleration, as a share of the largest. With a
 /// factor of five between neighbours the nearest model predicts not much worse than the exact one
-/// would; the last is constant velocity.
+/// would; the last is constant velocity. With half of each the liveliest turns exceed every model.
 const LIVELINESS: [f64; WAYS] = [1.0, 0.2, 0.04, 0.0];
 /// Rate at which a target changes its motion model, 1/s; the new model is drawn from all models
 /// with equal probability. With a tenth of it the first images of a turn come as surprises, and
@@ -30,7 +32,8 @@ const LIVELINESS: [f64; WAYS] = [1.0, 0.2, 0.04, 0.0];
 /// ten times as much 2.1.
 const CHANGES_PER_S: f64 = 0.5;
 /// Model weights of a target that is taken up or found again: nobody knows whether it flies evenly,
-/// so all weight is on the largest acceleration until the images show otherwise.
+/// so all weight is on the largest acceleration until the images show otherwise. With half of it on
+/// an even model a target that turns as it is taken up is predicted beside it.
 const AT_FIRST: [f64; WAYS] = [1.0, 0.0, 0.0, 0.0];
 
 /// Averaging time of the match of the measurement noise to the innovations, s: some hundred
@@ -39,11 +42,11 @@ const AT_FIRST: [f64; WAYS] = [1.0, 0.0, 0.0, 0.0];
 /// sky keeps for seconds the noise that it had before the old one.
 const MATCHED_S: f64 = 3.0;
 /// Weight of the expected noise, as a time of innovations, s: it counts as much as the first dozen
-/// innovations, which tell the noise to a third. With half of it the first innovation alone may
+/// innovations, which show the noise to a third. With half of it the first innovation alone may
 /// change the variance by 42 % instead of 23, at 30 per second.
 const AT_LEAST_S: f64 = 0.5;
 /// How strongly the noise factor is pulled back to the expected noise, per unit of its logarithm.
-/// Where the target's own motion makes up most of the innovations they tell little of the noise,
+/// Where the target's own motion makes up most of the innovations they say little of the noise,
 /// and nothing else keeps the factor in place. With three times as much the noise found for even
 /// and for lively targets changes by less than 4 %.
 const AS_EXPECTED: f64 = 0.01;
@@ -76,12 +79,12 @@ pub(crate) struct ImageMotion {
     measured: [f64; 2],
     /// Share of the measurement noise in the variance of that measurement's innovation, averaged
     /// over the models by their weights.
-    told: f64,
+    noise_share: f64,
     /// Acceleration variance of each model, px^2/s^4.
     accelerations: [f64; WAYS],
     /// Variance in the offset from the noise of the learned images that is not yet in the
     /// covariances, in units of one measurement's variance, which is unknown before the first one.
-    untold: f64,
+    offset_noise: f64,
 }
 
 /// Measurement of where the reference is found in one image, as parts of a mixture.
@@ -104,14 +107,7 @@ impl ImageMotion {
         velocity_sd: f64,
         acceleration_sd: f64,
     ) -> Self {
-        let all = given.map(|AxisMeasurement { position, variance }| {
-            // P = v o o', o = [1, 0, -1]': H o = 0, so that the given place's error is not in where
-            // the reference is found.
-            let off = Vector3::new(1.0, 0.0, -1.0);
-            let mut covariance = off * off.transpose() * variance;
-            covariance[(VELOCITY, VELOCITY)] = velocity_sd.powi(2);
-            AxisMotion { mean: Vector3::new(position, 0.0, 0.0), covariance }
-        });
+        let all = given.map(|given| AxisMotion::at_rest(given, velocity_sd));
         Self {
             ways: [all; WAYS],
             weights: AT_FIRST,
@@ -121,9 +117,9 @@ impl ImageMotion {
             all,
             gains: [[Vector3::zeros(); 2]; WAYS],
             measured: [0.0; 2],
-            told: 0.0,
+            noise_share: 0.0,
             accelerations: LIVELINESS.map(|share| (share * acceleration_sd).powi(2)),
-            untold: 1.0,
+            offset_noise: 1.0,
         }
     }
 
@@ -229,9 +225,9 @@ impl ImageMotion {
             let edge = side as f64 - 1.0;
             if !(0.0..=edge).contains(&self.all[i].mean[POSITION]) {
                 // Every model is put at the border, so that the mixture is there too.
-                let held = self.all[i].mean[POSITION].clamp(0.0, edge);
+                let at_border = self.all[i].mean[POSITION].clamp(0.0, edge);
                 for axis in self.ways.iter_mut().map(|way| &mut way[i]).chain([&mut self.all[i]]) {
-                    (axis.mean[POSITION], axis.mean[VELOCITY]) = (held, 0.0);
+                    (axis.mean[POSITION], axis.mean[VELOCITY]) = (at_border, 0.0);
                 }
             }
         }
@@ -323,24 +319,24 @@ impl ImageMotion {
         self.matched_s = (self.matched_s + self.interval).min(MATCHED_S);
         // A running mean at first, with `AT_LEAST_S` of expected noise in it; exponential later.
         let share = (self.interval / (self.matched_s + AT_LEAST_S)).min(1.0);
-        // Relative step: told (nis / 2 - 1), whose mean is 0 if the noise is right, and the pull
-        // back.
-        let more =
-            self.told * (nis.min(OUTLIER) / 2.0 - 1.0) - AS_EXPECTED * self.noise_factor.ln();
+        // Relative step: the noise's share times (nis / 2 - 1), whose mean is 0 if the noise is
+        // right, and the pull back.
+        let more = self.noise_share * (nis.min(OUTLIER) / 2.0 - 1.0)
+            - AS_EXPECTED * self.noise_factor.ln();
         let factor = self.noise_factor * (1.0 + share * more);
         self.noise_factor = factor.clamp(1.0 / MOST_MATCHED, MOST_MATCHED);
     }
 
     /// Adds to the offset's variance what the noise of the images learned so far has in it: the
     /// first measurement's variances stand for the noise of each.
-    pub(crate) fn tell_noise(&mut self, variances: [f64; 2]) {
-        if self.untold <= 0.0 {
+    pub(crate) fn add_noise_of_learned(&mut self, variances: [f64; 2]) {
+        if self.offset_noise <= 0.0 {
             return;
         }
-        let untold = std::mem::take(&mut self.untold);
+        let offset_noise = std::mem::take(&mut self.offset_noise);
         for axes in self.ways.iter_mut().chain([&mut self.all]) {
             for (axis, variance) in axes.iter_mut().zip(variances) {
-                axis.covariance[(OFFSET, OFFSET)] += untold * variance;
+                axis.covariance[(OFFSET, OFFSET)] += offset_noise * variance;
             }
         }
     }
@@ -355,7 +351,7 @@ impl ImageMotion {
         let largest = likelihoods.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let likelihoods = likelihoods.map(|logarithm| (logarithm - largest).exp());
         let mean: f64 = likelihoods.iter().zip(self.weights).map(|(l, w)| l * w).sum();
-        let mut told = [0.0; WAYS];
+        let mut noise_shares = [0.0; WAYS];
         for (way, weight) in self.weights.iter_mut().enumerate() {
             // Bayes' rule for the models' weights; the share of the posterior without a measurement
             // leaves them as they are.
@@ -369,7 +365,7 @@ impl ImageMotion {
                 let gain = prior.variance / (prior.variance + at[i].variance);
                 // 1 - K = R / (P + R) is the noise's share of the innovation's variance; halved for
                 // the mean over both axes.
-                told[way] += (1.0 - gain) / 2.0;
+                noise_shares[way] += (1.0 - gain) / 2.0;
                 let here = AxisMeasurement {
                     position: prior.position + gain * (at[i].position - prior.position),
                     variance: (1.0 - gain) * prior.variance,
@@ -379,12 +375,11 @@ impl ImageMotion {
                 let parts =
                     [(near, here), (elsewhere, elsewhere_at[i]), (1.0 - near - elsewhere, prior)];
                 let position: f64 = parts.iter().map(|(mass, part)| mass * part.position).sum();
-                let spread = |(mass, part): &(f64, AxisMeasurement)| {
-                    mass * (part.variance + (part.position - position).powi(2))
-                };
+                let spread: f64 =
+                    parts.iter().map(|(mass, part)| mass * squared_about(position, part)).sum();
                 // However far off the other places are, one image widens the prediction to twice
                 // its standard deviation at most.
-                let variance = parts.iter().map(spread).sum::<f64>().min(4.0 * prior.variance);
+                let variance = spread.min(4.0 * prior.variance);
                 // The regression splits the gain over the states: part to the position, the rest to
                 // the offset.
                 self.gains[way][i] = axis.slope() * (near * gain);
@@ -393,7 +388,8 @@ impl ImageMotion {
         }
         let total: f64 = self.weights.iter().sum();
         self.weights.iter_mut().for_each(|weight| *weight /= total);
-        self.told = told.iter().zip(self.weights).map(|(told, weight)| told * weight).sum();
+        self.noise_share =
+            noise_shares.iter().zip(self.weights).map(|(share, weight)| share * weight).sum();
         self.combine();
     }
 
@@ -423,7 +419,7 @@ impl ImageMotion {
         // Where a variance is given the image's noise goes into the covariances below instead.
         let new = if variances.is_none() { share * share } else { 0.0 };
         // Noise of a mean: (1 - s)^2 of the old variance, s^2 of the new one.
-        self.untold = (1.0 - share).powi(2) * self.untold + new;
+        self.offset_noise = (1.0 - share).powi(2) * self.offset_noise + new;
         let place = [place.x, place.y];
         for (way, gains) in self.ways.iter_mut().zip(&self.gains) {
             for i in 0..2 {
@@ -446,7 +442,7 @@ impl ImageMotion {
         self.combine();
     }
 
-    /// Takes the reference for one that was cut out anew, `by` px beside its middle before: of the
+    /// Takes the reference for one that was cut out again, `by` px beside its middle before: of the
     /// target itself, whose place is then known to `variance`, px^2. That error is in the position
     /// and with the opposite sign in the offset, as at first.
     pub(crate) fn recentre(&mut self, by: [f64; 2], variance: f64) {
@@ -466,6 +462,11 @@ impl ImageMotion {
             }
         }
     }
+}
+
+/// Mean square of a normal distribution about a place.
+fn squared_about(place: f64, part: &AxisMeasurement) -> f64 {
+    part.variance + (part.position - place).powi(2)
 }
 
 #[cfg(test)]

@@ -6,9 +6,10 @@ use crate::crop::BRIGHTEST;
 /// twentieth. With half of it to a seventh and a fourteenth.
 const SAMPLES: usize = 100;
 /// Gain of the mask for white noise's standard deviation: the root of the sum of its squared
-/// weights.
+/// weights, so it follows from the mask. With half of it every noise counts twice.
 const MASK_GAIN: f32 = 6.0;
-/// Standard deviation of a normal distribution over its median absolute deviation.
+/// Standard deviation of a normal distribution over its median absolute deviation, a number of
+/// mathematics: `1 / Phi^-1(3/4)`.
 pub(crate) const OF_MEDIAN: f32 = 1.4826;
 
 /// The median of values, whose order is lost; 0 if there are none.
@@ -58,7 +59,7 @@ impl NoiseMeter {
                 let corners = a[0] + a[2] + c[0] + c[2];
                 let sides = a[1] + b[0] + b[2] + c[1];
                 let response = (corners - 2.0 * sides + 4.0 * b[1]).abs();
-                // Broken samples tell nothing.
+                // Broken samples say nothing.
                 if response <= BRIGHTEST {
                     self.responses.push(response);
                 }

@@ -11,13 +11,16 @@ use pulp::Arch;
 
 use crate::lanes;
 
-/// Mean time for which a target that is lost cannot be seen, s, and for which it then can. With
-/// half or twice of either the same is found.
+/// Mean time for which a target that is lost cannot be seen, s. With half or twice of it the same
+/// is found.
 const UNSEEN_S: f64 = 1.0;
+/// Mean time for which a lost target can then be seen, s. With half or twice of it the same is
+/// found.
 const IN_SIGHT_S: f64 = 2.0;
 /// Most that one image says for a cell, nats: what looks like the target by its noise has a
 /// likelihood that no model of noise foresees, but it is elsewhere in the next image. With 4 a
-/// tenth more of small targets in noise is lost, with 10 as many.
+/// tenth more of small targets in noise is lost, with 10 as many. With half of it one place is sure
+/// an image or two later.
 const MOST_OF_IMAGE: f32 = 6.0;
 
 /// The distribution over the cells of a picture's grid.
@@ -71,7 +74,7 @@ impl PlaceMap {
         self.coarseness == coarseness && [self.cells.width(), self.cells.height()] == sides
     }
 
-    /// Moves on to an image that is taken `interval` s later: the target has moved by up to `reach`
+    /// Moves on to an image of `interval` s later: the target has moved by up to `reach`
     /// px on either axis, and by one cell at least, and the scene by `moved` px. What leaves the
     /// image cannot be seen.
     pub(crate) fn predict(
@@ -112,7 +115,7 @@ impl PlaceMap {
         let cells = self.cells.samples_mut();
         Arch::new().dispatch(|| {
             for (cell, ratio) in cells.iter_mut().zip(ratios.samples()) {
-                // Broken samples tell nothing.
+                // Broken samples say nothing.
                 let ratio = if ratio.is_nan() { 0.0 } else { ratio.min(MOST_OF_IMAGE) };
                 *cell *= lanes::exp(ratio);
             }
@@ -274,7 +277,7 @@ mod tests {
             }
             images.push(found.unwrap_or(40));
         }
-        // An image tells 4.5 nats, less the 2.2 by which nine cells are chosen from, and 9.9 + 4.6
+        // An image gives 4.5 nats, less the 2.2 by which nine cells are chosen from, and 9.9 + 4.6
         // are needed: about seven images.
         images.sort_unstable();
         assert!((4..=9).contains(&images[25]) && images[45] < 20, "{images:?}");
@@ -360,7 +363,7 @@ mod tests {
                 let mut ratios = image(&mut rng, None);
                 ratios.samples_mut().iter_mut().for_each(|ratio| *ratio *= scale);
                 map.update(&ratios);
-                prop_assert!((total(&map) - 1.0).abs() < 1e-3, "updated: {}", total(&map));
+                prop_assert!((total(&map) - 1.0).abs() < 1e-3, "after the update: {}", total(&map));
                 prop_assert!(map.cells.samples().iter().all(|cell| *cell >= 0.0));
             }
         }

@@ -65,7 +65,7 @@ pub(crate) struct Posterior {
 impl Posterior {
     /// The posterior if what is near the peak is the target with probability `probability` only;
     /// the rest of that mass goes to `unseen`.
-    pub(crate) fn doubted(&self, probability: f64) -> Self {
+    pub(crate) fn discounted(&self, probability: f64) -> Self {
         let near = PosteriorPart { mass: self.near.mass * probability, ..self.near };
         Self { near, unseen: self.unseen + self.near.mass - near.mass, ..*self }
     }
@@ -216,15 +216,15 @@ fn part(mass: f64, first: [f64; 2], second: [f64; 2]) -> PosteriorPart {
     PosteriorPart { mass, mean, variance }
 }
 
-/// The rest of a whole when a part is taken out, by the difference of their moments.
-fn without(whole: PosteriorPart, taken: PosteriorPart) -> PosteriorPart {
-    let rest = whole.mass - taken.mass;
+/// The rest of a whole without one part, by the difference of their moments.
+fn without(whole: PosteriorPart, removed: PosteriorPart) -> PosteriorPart {
+    let rest = whole.mass - removed.mass;
     // What is left of two nearly equal sums is rounding, and has next to no mass.
     if rest <= 1e-6 * whole.mass {
-        return taken;
+        return removed;
     }
-    let ([wf, ws], [tf, ts]) = (sums(whole), sums(taken));
-    part(rest, [wf[0] - tf[0], wf[1] - tf[1]], [ws[0] - ts[0], ws[1] - ts[1]])
+    let ([wf, ws], [rf, rs]) = (sums(whole), sums(removed));
+    part(rest, [wf[0] - rf[0], wf[1] - rf[1]], [ws[0] - rs[0], ws[1] - rs[1]])
 }
 
 /// The sums of w x and of w x^2 per axis, back from the moments.

@@ -4,26 +4,27 @@
 use crossfix_correlation::Plane;
 
 /// Step between the pixels of the smoothed picture that are used, in rows and columns: those
-/// between tell the same. With half of it they cost four times as much.
+/// between say the same. With half of it they cost four times as much.
 pub(crate) const STRIDE: usize = 2;
-/// Most iterations of the registration, and the length of a step that ends it, pixels. With half of
-/// the first a shift of more than three of the longest steps is not reached, with half of the
-/// second a step more is taken.
+/// Most iterations of the registration. With half of it a shift of more than three of the longest
+/// steps is not reached.
 const STEPS: usize = 6;
+/// Length of a step that ends the registration, pixels: its error is then far below what the change
+/// between pictures needs. With half of it one step more is computed.
 const SETTLED: f32 = 0.003;
 /// Longest step, pixels: a longer one is a mistake, and is cut to this. With half of it shifts of
 /// more than `STEPS` pixels are not reached.
 const LONGEST_STEP: f32 = 2.0;
 /// Difference of brightness beyond which a pixel counts for less, levels: a target that moves is no
-/// turn. With half of it the edges that tell a large turn count for less, and it is not reached.
+/// turn. With half of it the edges that show a large turn count for less, and it is not reached.
 const OUTLYING: f32 = 5.0;
 /// Least reduction of the misfit by a turn, in units of one pixel's mean misfit. Two smoothed
 /// pictures of noise alone fit better by up to 60 at some shift nearby, as only one pixel in
 /// eighteen is independent; with half of it a clear sky turns by chance, with twice as much a turn
-/// is told a frame later.
+/// is found a frame later.
 const SIGNIFICANT: f32 = 120.0;
-/// Fewest pixels in common (sum of their weights) that tell a turn. With half of it they may all be
-/// those of one target.
+/// Fewest pixels in common (sum of their weights) from which a turn is found. With half of it they
+/// may all be those of one target.
 pub(crate) const LEAST_COMMON: f32 = 50.0;
 
 /// Indices of a row that, moved by `by`, are in the row together with the next index.
@@ -70,11 +71,11 @@ impl RegistrationEquations {
         let [x, y] = [self.slope_off[0] - sx * off / n, self.slope_off[1] - sy * off / n];
         // ... and solved by Cramer's rule: (slope slope') step = slope off.
         let determinant = xx * yy - xy * xy;
-        // A single straight edge tells no shift along itself: the determinant vanishes against the
+        // A single straight edge shows no shift along itself: the determinant vanishes against the
         // squared trace.
-        let told = determinant > 1e-6 * (xx + yy).powi(2) && determinant > 0.0;
+        let is_known = determinant > 1e-6 * (xx + yy).powi(2) && determinant > 0.0;
         let step = [(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant];
-        told.then(|| step.map(|s| s.clamp(-LONGEST_STEP, LONGEST_STEP)))
+        is_known.then(|| step.map(|s| s.clamp(-LONGEST_STEP, LONGEST_STEP)))
     }
 }
 
@@ -112,8 +113,9 @@ fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> RegistrationEquation
     normal
 }
 
-/// Columns and rows of the tiles into which a picture is divided, to tell a turn from a target that
-/// moves. With half of each two targets with what is `AROUND` them cover nearly all tiles.
+/// Columns and rows of the tiles into which a picture is divided, to distinguish a turn from a
+/// target that moves. With half of each two targets with what is `AROUND` them cover nearly all
+/// tiles.
 const TILES: [usize; 2] = [12, 9];
 /// Reach of a target about the tile whose misfit a turn would lessen most, tiles: 50 px of a
 /// picture of 320x240, and what smoothing makes of them. With half of it the far edges of such a
@@ -125,22 +127,43 @@ const AROUND: usize = 2;
 /// alone are enough.
 const ELSEWHERE: f32 = 0.1;
 
-/// Weighted sum of the squared differences in each tile, and the sum of the weights.
+/// How badly two pictures fit in one tile, or in several together.
+#[derive(Clone, Copy, Debug, Default)]
+struct TileMisfit {
+    /// Weighted sum of the squared differences.
+    squares: f32,
+    /// Sum of the weights.
+    weights: f32,
+}
+
+impl TileMisfit {
+    /// Reduction of the mean square from `before`, times the present sum of weights.
+    fn gain(self, before: Self) -> f32 {
+        // Means are compared, as the two shifts have different numbers of pixels in common.
+        (before.mean() - self.mean()) * self.weights
+    }
+
+    fn mean(self) -> f32 {
+        self.squares / self.weights.max(f32::MIN_POSITIVE)
+    }
+}
+
+/// The misfit in each tile.
 #[derive(Clone, Copy, Debug)]
-struct Misfits([[(f32, f32); TILES[0]]; TILES[1]]);
+struct Misfits([[TileMisfit; TILES[0]]; TILES[1]]);
 
 impl Misfits {
     /// The misfits of two pictures at a shift, pixels, if the newer one is brighter by `brighter`
     /// levels.
     fn at(now: &Plane, then: &Plane, shift: [f32; 2], brighter: f32) -> Self {
         let sides = [now.width(), now.height()];
-        let mut tiles = [[(0.0, 0.0); TILES[0]]; TILES[1]];
+        let mut tiles = [[TileMisfit::default(); TILES[0]]; TILES[1]];
         each_off(now, then, shift, |[x, y], _, off| {
             let off = off - brighter;
             let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
-            let (squares, weights) = &mut tiles[y * TILES[1] / sides[1]][x * TILES[0] / sides[0]];
-            *squares += weight * off * off;
-            *weights += weight;
+            let tile = &mut tiles[y * TILES[1] / sides[1]][x * TILES[0] / sides[0]];
+            tile.squares += weight * off * off;
+            tile.weights += weight;
         });
         Self(tiles)
     }
@@ -150,8 +173,8 @@ impl Misfits {
     /// the other.
     fn are_better_than(&self, before: &Self) -> bool {
         let whole = self.gain(before, &[]);
-        let (squares, weights) = self.sums(&[]);
-        let of_pixel = squares / weights.max(LEAST_COMMON);
+        let all = self.sum(&[]);
+        let of_pixel = all.squares / all.weights.max(LEAST_COMMON);
         if whole <= SIGNIFICANT * of_pixel {
             return false;
         }
@@ -160,24 +183,27 @@ impl Misfits {
         self.gain(before, &[first, second]) > ELSEWHERE * whole
     }
 
-    /// Sums of squares and of weights over the tiles that are not near `others`.
-    fn sums(&self, others: &[[usize; 2]]) -> (f32, f32) {
-        let kept = tiles().filter(|tile| !others.iter().any(|other| is_about(*tile, *other)));
-        kept.fold((0.0, 0.0), |(squares, weights), [x, y]| {
-            (squares + self.0[y][x].0, weights + self.0[y][x].1)
-        })
+    /// The misfit of all tiles together that are not near `others`.
+    fn sum(&self, others: &[[usize; 2]]) -> TileMisfit {
+        let mut sum = TileMisfit::default();
+        for [x, y] in tiles_apart_from(others) {
+            sum.squares += self.0[y][x].squares;
+            sum.weights += self.0[y][x].weights;
+        }
+        sum
     }
 
     /// Reduction of the squares from `before`, over the tiles that are not near `others`.
     fn gain(&self, before: &Self, others: &[[usize; 2]]) -> f32 {
-        gain_of(before.sums(others), self.sums(others))
+        self.sum(others).gain(before.sum(others))
     }
 
     /// The tile with the largest reduction, of those that are not near `others`.
     fn most_gained(&self, before: &Self, others: &[[usize; 2]]) -> [usize; 2] {
-        let gain = |[x, y]: [usize; 2]| gain_of(before.0[y][x], self.0[y][x]);
-        let kept = tiles().filter(|tile| !others.iter().any(|other| is_about(*tile, *other)));
-        kept.max_by(|one, other| gain(*one).total_cmp(&gain(*other))).unwrap_or_default()
+        let gain = |[x, y]: [usize; 2]| self.0[y][x].gain(before.0[y][x]);
+        tiles_apart_from(others)
+            .max_by(|one, other| gain(*one).total_cmp(&gain(*other)))
+            .unwrap_or_default()
     }
 }
 
@@ -186,20 +212,18 @@ fn tiles() -> impl Iterator<Item = [usize; 2]> {
     (0..TILES[1]).flat_map(|y| (0..TILES[0]).map(move |x| [x, y]))
 }
 
+/// The tiles that are not near any of `others`.
+fn tiles_apart_from(others: &[[usize; 2]]) -> impl Iterator<Item = [usize; 2]> {
+    tiles().filter(|tile| !others.iter().any(|other| is_about(*tile, *other)))
+}
+
 fn is_about([x, y]: [usize; 2], [column, row]: [usize; 2]) -> bool {
     x.abs_diff(column) <= AROUND && y.abs_diff(row) <= AROUND
 }
 
-/// Reduction of the mean square, times the present sum of weights.
-fn gain_of(before: (f32, f32), now: (f32, f32)) -> f32 {
-    // Means are compared, as the two shifts have different numbers of pixels in common.
-    let mean = |(squares, weights): (f32, f32)| squares / weights.max(f32::MIN_POSITIVE);
-    (mean(before) - mean(now)) * now.1
-}
-
 /// Shift of a picture against an older one, px, iterated from a first guess (Lucas and Kanade
 /// 1981). `None` where the shift explains no more than noise would, or than a target that moves: a
-/// clear sky tells no turn.
+/// clear sky shows no turn.
 pub(crate) fn registered(now: &Plane, then: &Plane, first: [f32; 2]) -> Option<[f32; 2]> {
     if (then.width(), then.height()) != (now.width(), now.height()) {
         return None;

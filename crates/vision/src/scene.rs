@@ -12,16 +12,19 @@ use crate::crop::replace_invalid;
 use crate::noise::median;
 use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
 
-/// Number of pictures that are kept, the latest, and the time between them, s: they reach back for
-/// 3 to 3.6 s. With half of either a slow target hides the same part of the scene in all of them;
-/// with more, light and clouds are different by then.
+/// Number of pictures that are kept, the latest: they reach back for 3 to 3.6 s. With half of it a
+/// slow target hides the same part of the scene in all of them; with more, light and clouds are
+/// different by then.
 const PICTURES: usize = 6;
+/// Time between these pictures, s. With half of it they reach back half as far, as with half as
+/// many.
 const SPACING_S: f64 = 0.6;
 /// Preferred age of the picture from which a change is computed, s: a target has moved by its own
 /// size by then. With half of it a target that has moved by half its size cancels by half.
 const CHANGED_S: f64 = 1.0;
 /// Side of the blocks that make one pixel of the coarse picture, px; the camera's turn is found in
-/// that. In single pixels the noise has more slope than clouds have, and no turn is noticed.
+/// that. In single pixels the noise has more slope than clouds have, and no turn is noticed; with
+/// half of it the noise of a block is twice as large, and faint clouds show no turn.
 const COARSENESS: usize = 8;
 /// How often the coarse picture is smoothed, each time with weights of a quarter, a half and a
 /// quarter for neighbours. With half of it noise keeps more of its slope, against the scene's.
@@ -46,6 +49,7 @@ struct Jerk {
     usual_s: f64,
 }
 
+/// The numbers in use; what half of each does is said at its field.
 const JERK: Jerk = Jerk { factor: 1.5, levels: 0.25, usual_s: 0.65 };
 
 /// A picture of the scene.
@@ -86,8 +90,8 @@ impl ScenePicture {
     }
 }
 
-/// Of this many blocks along a row one is looked at: there are hundreds, and a jerk has to change
-/// half of them. With half of it the glance costs twice as much and tells the same.
+/// Of this many blocks along a row one is compared: there are hundreds, and a jerk has to change
+/// half of them. With half of it the glance costs twice as much and shows the same.
 const GLANCED: usize = 4;
 
 /// One row of some blocks, by which a jerk of the camera is noticed at a tenth of the cost of a
@@ -117,7 +121,7 @@ impl RowGlance {
         for (before, now) in means.iter_mut().zip(now) {
             let change = (now - *before).abs();
             *before = now;
-            // Broken samples tell nothing.
+            // Broken samples say nothing.
             if change.is_finite() {
                 changes.push(change);
             }
@@ -140,10 +144,11 @@ pub(crate) struct SceneMemory {
     coarse: Plane,
     between: Plane,
     sums: Vec<f32>,
-    taken: u64,
+    /// Number of pictures kept since the beginning.
+    count: u64,
     /// Whether the camera had not turned when it was registered last, and the time since then, s.
     is_still: bool,
-    unlooked_s: f64,
+    unregistered_s: f64,
     glance: RowGlance,
     /// Shift of the scene since the beginning, when the newest picture was taken, px.
     turned: [f64; 2],
@@ -164,7 +169,7 @@ impl SceneMemory {
 
     /// The number of the newest picture; 0 before the first.
     pub(crate) fn newest(&self) -> u64 {
-        self.taken
+        self.count
     }
 
     /// Shift of the scene since the beginning: what is at (x, y) was at (x, y) plus this, px.
@@ -185,20 +190,21 @@ impl SceneMemory {
     /// that one the other pictures are shifted as when it was taken. A camera that stood still
     /// lately is registered only now and then.
     pub(crate) fn register(&mut self, image: &Plane, interval: f64) {
-        self.unlooked_s += interval;
+        self.unregistered_s += interval;
         for picture in &mut self.pictures {
             picture.age_s += interval;
         }
         let is_jerked = self.glance.is_another(image, interval);
         // Half an interval is added so that the image nearest to the time is used.
-        let is_time = is_jerked || !self.is_still || self.unlooked_s + interval / 2.0 >= STILL_S;
+        let is_time =
+            is_jerked || !self.is_still || self.unregistered_s + interval / 2.0 >= STILL_S;
         // A picture that will be kept needs its coarse version and its shift, whatever the camera
         // does.
         let is_kept = self.pictures.first().is_none_or(|newest| newest.age_s >= SPACING_S);
         if !is_time && !is_kept {
             return;
         }
-        self.unlooked_s = 0.0;
+        self.unregistered_s = 0.0;
         coarsened(image, &mut self.coarse, &mut self.sums);
         replace_invalid(&mut self.coarse);
         smooth(&mut self.coarse, &mut self.between);
@@ -222,8 +228,8 @@ impl SceneMemory {
     /// Keeps a picture if it is time to, and returns its number.
     pub(crate) fn keep(&mut self, image: &Plane) -> Option<u64> {
         let is_new = self.pictures.first().is_some_and(|newest| newest.age_s < SPACING_S);
-        let looked_at = (self.coarse.width() / STRIDE) * (self.coarse.height() / STRIDE);
-        if is_new || (looked_at as f32) < LEAST_COMMON {
+        let used = (self.coarse.width() / STRIDE) * (self.coarse.height() / STRIDE);
+        if is_new || (used as f32) < LEAST_COMMON {
             return None;
         }
         // Each picture is registered itself, so that errors do not add up from picture to picture.
@@ -238,13 +244,13 @@ impl SceneMemory {
         } else {
             self.pictures.remove(self.pictures.len() - 1)
         };
-        self.taken += 1;
+        self.count += 1;
         kept.image.copy_from(image);
         replace_invalid(&mut kept.image);
         kept.coarse.copy_from(&self.coarse);
-        (kept.age_s, kept.shift, kept.number) = (0.0, [0.0; 2], self.taken);
+        (kept.age_s, kept.shift, kept.number) = (0.0, [0.0; 2], self.count);
         self.pictures.insert(0, kept);
-        Some(self.taken)
+        Some(self.count)
     }
 
     /// Fills `change` with what has changed since about a second ago: the image less what was there
@@ -289,8 +295,8 @@ impl SceneMemory {
 fn turned(now: &Plane, then: &Plane, before: [f64; 2]) -> [f64; 2] {
     let coarseness = COARSENESS as f64;
     // From the last shift on: registration finds only shifts near its first guess.
-    let told = registered(now, then, before.map(|turned| (turned / coarseness) as f32));
-    told.map_or(before, |turned| turned.map(|turned| f64::from(turned) * coarseness))
+    let found = registered(now, then, before.map(|turned| (turned / coarseness) as f32));
+    found.map_or(before, |turned| turned.map(|turned| f64::from(turned) * coarseness))
 }
 
 /// The means of blocks. `sums` is memory for a row of them.
@@ -380,7 +386,7 @@ mod tests {
 
     #[test]
     fn a_turn_of_the_camera_is_found_in_noise_and_adds_up() {
-        // In the noise of a tenth of all levels a turn has to be a pixel or two before it is told.
+        // In the noise of a tenth of all levels a turn has to be a pixel or two before it is found.
         for (noise, most) in [(0.5, 0.6), (25.0, 2.0)] {
             let mut scene = SceneMemory::default();
             let turned = |frame: u32| [0.8 * f64::from(frame), -0.5 * f64::from(frame)];

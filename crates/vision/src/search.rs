@@ -1,5 +1,25 @@
 //! Search for a lost target: in the image, where a map keeps what all images so far say of every
 //! place, and in what has changed, where no cloud is.
+//!
+//! The search in the image goes through the stages of a step ([`crate::followed_target`]) in their
+//! order, but only two are the same code: the likelihood ratios (`likelihood.rs`) and the fit
+//! (`fit.rs`). The others would fail over a gate as wide as the image:
+//!
+//! - *Gate*: the whole image, in cells of several pixels (`coarse.rs`). At full resolution it would
+//!   have a hundred times as many placements as a gate, for every lost target.
+//! - *Likelihood*: less what the scene itself has there, and with the noise of all the picture's
+//!   contrasts: of a hundred thousand cells some look like the target, of a gate's few hundred
+//!   none.
+//! - *Posterior*: over a grid, and over all images since the loss (`place_map.rs`), not over one
+//!   image with the motion filter's prediction as its prior. No single image shows a small target
+//!   in noise, and the filter's Gaussian cannot describe many far places between two images.
+//! - *Fit*: the best cell is first refined to the best placement at full resolution.
+//! - *Update*: the motion filters begin at the fit, as their prediction is worth little by then,
+//!   and on probation (`followed_target/lost.rs`, `identity.rs`); nothing is learnt.
+//!
+//! In what has changed there is one picture and no map: pictures of the same second's change
+//! contain each other, so that their evidence must not be multiplied. A find there, or in a single
+//! image, must be clear by itself ([`CLEAR_FIND`]).
 
 use crossfix_correlation::Plane;
 
@@ -8,7 +28,7 @@ use crate::coarse::{CoarseReference, PictureLikeness, coarsened};
 use crate::crop::{crop, replace_invalid};
 use crate::fit::TargetFit;
 use crate::frame::FrameInput;
-use crate::identity::Identity;
+use crate::identity::TargetIdentity;
 use crate::likelihood::log_ratios;
 use crate::place_map::PlaceMap;
 use crate::scratch::Scratch;
@@ -37,6 +57,7 @@ pub(crate) struct ClearFind {
     above_chance: f64,
 }
 
+/// The conditions in use; what half of each does is said at its field.
 pub(crate) const CLEAR_FIND: ClearFind =
     ClearFind { least_ratio: 3.0, least_margin: 1.0, above_chance: 4.0 };
 /// Variance of the noise in the picture of what has changed, over that in the image: the image's
@@ -56,7 +77,7 @@ struct Searched<'a> {
 /// A lost target, with what is kept for its search.
 pub(crate) struct Sought<'a> {
     pub(crate) state: &'a mut TargetBelief,
-    pub(crate) identity: &'a Identity,
+    pub(crate) identity: &'a TargetIdentity,
     pub(crate) memory: &'a mut SearchMemory,
 }
 
@@ -70,27 +91,30 @@ impl Sought<'_> {
         scratch: &mut Scratch,
     ) -> Option<TargetFit> {
         self.memory.take_first(self.state, frame.config, &mut scratch.buffers);
-        let found = self.find_in_image(frame, scratch).or_else(|| {
-            self.memory.take_last(self.state);
-            // By fours: change by the last appearance, none, change by the first, none.
-            let searches = self.memory.searches;
-            self.memory.searches += 1;
-            if searches / 2 % 2 == 1 {
-                self.memory.take_first(self.state, frame.config, &mut scratch.buffers);
-            }
-            let is_turn =
-                searches.is_multiple_of(2) && frame.config.has(TrackerPart::SearchInChange);
-            if is_turn { self.find_in_change(frame, scratch) } else { None }
-        });
+        let found =
+            self.find_in_image(frame, scratch).or_else(|| self.find_by_turns(frame, scratch));
         if found.is_none() {
             self.memory.take_last(self.state);
         }
         found
     }
 
-    /// Takes an image into the map of where the target may be; returns the target if that leaves
-    /// next to no doubt, or if the image alone shows it clearly: one that comes out of a cloud is
-    /// found in the first image, and not in the second.
+    /// Searches what has changed, if it is time to, by the appearance whose turn it is.
+    fn find_by_turns(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetFit> {
+        self.memory.take_last(self.state);
+        // By fours: change by the last appearance, none, change by the first, none.
+        let searches = self.memory.searches;
+        self.memory.searches += 1;
+        if searches / 2 % 2 == 1 {
+            self.memory.take_first(self.state, frame.config, &mut scratch.buffers);
+        }
+        let is_turn = searches.is_multiple_of(2) && frame.config.has(TrackerPart::SearchInChange);
+        if is_turn { self.find_in_change(frame, scratch) } else { None }
+    }
+
+    /// Takes an image into the map of where the target may be; returns the target if that is next
+    /// to certain of one place, or if the image alone shows it clearly: one that comes out of a
+    /// cloud is found in the first image, and not in the second.
     fn find_in_image(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetFit> {
         let coarse = CoarseReference::of(self.state, frame.image, scratch)?;
         self.remember_background(frame, &coarse, scratch);
@@ -185,7 +209,7 @@ impl Sought<'_> {
     }
 
     /// The best placement within `reach` px of a place in a picture, and the fit in the image
-    /// there: the image tells the place best, what has changed has the noise of two pictures.
+    /// there: the image shows the place best, what has changed has the noise of two pictures.
     fn at_full_resolution(
         &mut self,
         frame: FrameInput<'_>,
@@ -224,24 +248,28 @@ impl Sought<'_> {
         let turned = frame.scene.turned();
         let known =
             self.memory.map.take().filter(|known| known.places.fits(area.coarseness, sides));
-        let mut map = known.unwrap_or_else(|| {
-            let prior = area.prior(state, frame.config);
-            let velocity = state.velocity();
-            SearchMap {
-                places: PlaceMap::new(area.coarseness, sides, |x, y| {
-                    prior.density([area.middle(x), area.middle(y)]) as f32
-                }),
-                unseen_s: state.unseen_s,
-                turned,
-                speed: velocity.x.hypot(velocity.y),
-            }
-        });
+        let mut map = known.unwrap_or_else(|| self.first_map(frame, area, sides));
         let elapsed = (state.unseen_s - map.unseen_s).max(0.0);
         // The same thing has moved in the image by what the scene had turned before, less now.
         let moved = [0, 1].map(|i| map.turned[i] - turned[i]);
         map.places.predict(elapsed, map.speed * elapsed, moved, &mut scratch.search.spread);
         (map.unseen_s, map.turned) = (state.unseen_s, turned);
         &mut self.memory.map.insert(map).places
+    }
+
+    /// The map before any image is in it: the prior of the target's place.
+    fn first_map(&self, frame: FrameInput<'_>, area: &SearchArea, sides: [usize; 2]) -> SearchMap {
+        let state = &*self.state;
+        let prior = area.prior(state, frame.config);
+        let velocity = state.velocity();
+        SearchMap {
+            places: PlaceMap::new(area.coarseness, sides, |x, y| {
+                prior.density([area.middle(x), area.middle(y)]) as f32
+            }),
+            unseen_s: state.unseen_s,
+            turned: frame.scene.turned(),
+            speed: velocity.x.hypot(velocity.y),
+        }
     }
 
     /// Notes the log likelihood ratios of the scene itself, from the snapshot, once per loss.

@@ -200,16 +200,20 @@ impl SearchArea {
     ) -> Option<EmptyScene<'a>> {
         let background = memory.background.as_ref()?;
         let shift = [0, 1].map(|i| turned[i] - background.turned[i]);
-        let hidden = [0, 1].map(|i| {
-            let (reach, seen) = (self.sides[i] as f64, [seen.x, seen.y][i]);
-            let off = |index: usize| self.middle(index) + shift[i] - seen;
-            let first = (0..picture[i]).find(|index| off(*index) >= -reach);
-            let first = first.unwrap_or(picture[i]);
-            let end = (first..picture[i]).find(|index| off(*index) > reach);
-            first..end.unwrap_or(picture[i])
-        });
+        let seen = [seen.x, seen.y];
+        let hidden =
+            [0, 1].map(|i| self.hidden(picture[i], self.sides[i] as f64, shift[i], seen[i]));
         let by = shift.map(|shift| (shift / self.coarseness as f64).round() as isize);
         Some(EmptyScene { ratios: &background.ratios, by, hidden })
+    }
+
+    /// The columns (or rows) of `count` that a target hides which is `seen` there and reaches as
+    /// far as `reach`, px, when they have moved by `shift`, px.
+    fn hidden(&self, count: usize, reach: f64, shift: f64, seen: f64) -> Range<usize> {
+        let off = |index: usize| self.middle(index) + shift - seen;
+        let first = (0..count).find(|index| off(*index) >= -reach).unwrap_or(count);
+        let end = (first..count).find(|index| off(*index) > reach);
+        first..end.unwrap_or(count)
     }
 
     /// The middle of a cell of the coarse picture, px of the full picture.

@@ -19,14 +19,15 @@ use crate::tracker_part::TrackerPart;
 /// Correlation below which two appearances are different: on the real and drawn cases those of
 /// targets that have not changed correlate by 0.94 or more, and 0.65 to 0.78 where the last one
 /// finds nothing. With half of it the first one is not searched for.
-const ALIKE: f32 = 0.8;
+const SAME_APPEARANCE: f32 = 0.8;
 /// For this long after it was seen a target is searched for by its last appearance alone, s: before
 /// that it has only been hidden, and has turned since it was first seen. With half of it one that
 /// turns is found where it is not, with twice as much one that has fooled its reference is found a
 /// second later.
 const LAST_ALONE_S: f64 = 1.0;
 /// Contrast with the first appearance: the target is as it was then; how much that may vary the
-/// search knows.
+/// search knows. With half of it the first appearance is expected at half the contrast, and a
+/// target as bright as at first is found later.
 const FIRST_CONTRAST: f64 = 1.0;
 
 /// What the scene itself looks like to a target's reference: the log ratios in a picture in which
@@ -39,7 +40,7 @@ pub(crate) struct Background {
     pub(crate) turned: [f64; 2],
 }
 
-/// Where a target may be, as of the last image that was searched for it.
+/// Where a target may be, after the last image that was searched for it.
 #[derive(Clone, Debug)]
 pub(crate) struct SearchMap {
     pub(crate) places: PlaceMap,
@@ -74,6 +75,27 @@ struct OtherAppearance {
     is_like_the_first: bool,
 }
 
+impl OtherAppearance {
+    /// The first appearance of a target whose last one is in use.
+    fn first_of(
+        last: &Appearance,
+        config: &TrackerConfig,
+        buffers: &mut AppearanceScratch,
+    ) -> Self {
+        let appearance = last.at_first(config, buffers);
+        let is_like_the_first = last.likeness(&appearance) >= SAME_APPEARANCE;
+        Self {
+            appearance,
+            contrast: FIRST_CONTRAST,
+            usual_contrast: FIRST_CONTRAST,
+            usual_match: 1.0,
+            background: None,
+            is_last: false,
+            is_like_the_first,
+        }
+    }
+}
+
 impl SearchMemory {
     /// Forgets what belongs to one loss: the target has been seen.
     pub(crate) fn seen(&mut self) {
@@ -103,19 +125,9 @@ impl SearchMemory {
             return false;
         }
         let last = &state.appearance;
-        let other = self.other.get_or_insert_with(|| {
-            let appearance = last.at_first(config, buffers);
-            let is_like_the_first = last.likeness(&appearance) >= ALIKE;
-            Box::new(OtherAppearance {
-                appearance,
-                contrast: FIRST_CONTRAST,
-                usual_contrast: FIRST_CONTRAST,
-                usual_match: 1.0,
-                background: None,
-                is_last: false,
-                is_like_the_first,
-            })
-        });
+        let other = self
+            .other
+            .get_or_insert_with(|| Box::new(OtherAppearance::first_of(last, config, buffers)));
         if other.is_last || other.is_like_the_first {
             return false;
         }

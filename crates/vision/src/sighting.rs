@@ -2,7 +2,7 @@
 
 use crate::PixelBox;
 use crate::fit::TargetFit;
-use crate::followed_target::Target;
+use crate::followed_target::ImageTarget;
 use crate::frame::{FrameInput, TargetStep};
 use crate::scratch::Scratch;
 use crate::search::CLEAR_FIND;
@@ -29,7 +29,7 @@ pub(crate) struct SightingOfLost {
     as_at_first: bool,
 }
 
-impl Target {
+impl ImageTarget {
     /// The sighting of this target in a box that the detector has found, if it may be the target:
     /// that is lost, can have gone there, is about as large, and looked like it last or at first.
     pub(crate) fn sighting(

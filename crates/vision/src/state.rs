@@ -20,7 +20,8 @@ use crate::{ImagePoint, PixelBox, TrackerConfig};
 /// Images without the target after which it is searched for: noise hides it in one image and not in
 /// the next. With one, each blurred image begins a search; with six a lost target runs on with its
 /// prediction for 0.1 s longer, at thirty images a second. (A limit of 0.09 s, which is one image
-/// at ten a second, loses a fifth more frames there.)
+/// at ten a second, loses a fifth more frames there.) With half of it every second blurred image
+/// begins one.
 const SEARCH_AFTER_IMAGES: u32 = 3;
 /// Time constant of the running estimate of an image's noise, s. With half of it the noise in front
 /// of another background is known after 0.05 s, and a single image's counts 1.7 times as much.
@@ -28,13 +29,15 @@ const NOISE_S: f64 = 0.0935;
 /// Certainty above which a target counts as seen. With half of it a target is measured where it is
 /// likelier not to be.
 pub(crate) const SEEN: f64 = 0.5;
-/// Random walk of the log scale and of the turn, standard deviations per root second, and their
-/// largest variances. With half of the first a size is followed within 0.6 s instead of 0.3; with
-/// half of the second the gain after a long loss is 0.95 instead of 0.97.
+/// Random walk of the log scale and of the turn (rad), standard deviations per root second. With
+/// half of it a size is followed within 0.6 s instead of 0.3.
 const SHAPE_WALK: [f64; 2] = [0.0329, 0.1095];
+/// Largest variances of the log scale and of the turn, rad^2. With half of them the gain after a
+/// long loss is 0.95 instead of 0.97.
 const MOST_SHAPE_VARIANCE: [f64; 2] = [0.09, 0.25];
 /// Variances of both of a reference that has just been cut out: it has the target's size and
-/// direction by definition, but for what keeps a variance from being zero.
+/// direction by definition, but for what keeps a variance from being zero. With half of them the
+/// same.
 pub(crate) const CUT_OUT_SHAPE: [f64; 2] = [1e-6; 2];
 
 /// State of the belief about one target.

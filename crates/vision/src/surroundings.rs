@@ -7,9 +7,9 @@ use crate::figure::{SIDES, farthest, meant};
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Least number of images in the mean for the figure to be looked for; it is looked for again each
-/// time that the number has doubled. Reasoned: with half of it there is one look more, and the
+/// time that the number has doubled. Reasoned: with half of it there is one search more, and the
 /// first is at 3 dB more noise.
-pub(crate) const FIRST_LOOK: f32 = 4.0;
+pub(crate) const FIRST_SEARCH_IMAGES: f32 = 4.0;
 
 /// The mean of what is about a target in its images.
 #[derive(Clone, Debug)]
@@ -19,7 +19,8 @@ pub(crate) struct Surroundings {
     pub(crate) noise: f32,
     /// Number of images in it, each weighted by the certainty that it shows the target.
     pub(crate) images: f32,
-    pub(crate) next_look: f32,
+    /// Number of images at which the figure is looked for next.
+    pub(crate) next_search_images: f32,
 }
 
 impl Surroundings {
@@ -32,7 +33,7 @@ impl Surroundings {
             mean: Plane::from_fn(width, height, |_, _| 0.0),
             noise: 0.0,
             images: 0.0,
-            next_look: FIRST_LOOK,
+            next_search_images: FIRST_SEARCH_IMAGES,
         })
     }
 

@@ -10,16 +10,18 @@ use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
 use crate::detector::Detector;
-use crate::followed::{Followed, Follower, Origin, describe};
+use crate::followed::{Followed, Follower, TakenUpBy, describe};
 use crate::frame::{FrameInput, Measurement};
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
 use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig, TrackerConfigError, TrackerPart};
 
-/// Bounds of the time between images, s; other intervals are clamped to them: after a longer pause
-/// nothing is known of a target anyway, and no camera is faster. With half of the first a camera of
-/// less than two images per second forgets its scene with each; with half of the second the same.
+/// Longest time between images, s; longer ones are cut to it: after such a pause nothing is known
+/// of a target anyway. With half of it a camera of less than two images per second forgets its
+/// scene with each.
 const LONGEST_INTERVAL: f64 = 1.0;
+/// Shortest time between images, s; shorter ones are lengthened to it: no camera is faster. With
+/// half of it the same.
 const SHORTEST_INTERVAL: f64 = 1e-4;
 
 /// The life of a 2D track.
@@ -66,9 +68,9 @@ pub struct ImageTrack {
     pub nis: Option<f64>,
 }
 
-/// A candidate that keeps to its place for this long is dropped, s: a target that can be told from
-/// its scene has by then gone further than its size, if it moves at all. Half of it is little more
-/// than a candidate needs to be shown.
+/// A candidate that keeps to its place for this long is dropped, s: a target that can be
+/// distinguished from its scene has by then gone further than its size, if it moves at all. Half of
+/// it is little more than a candidate needs to be shown.
 const STAYS_S: f64 = 1.5;
 
 /// Snapshot: a picture of a moment ago in which every target was seen. It shows what a lost target
@@ -76,7 +78,7 @@ const STAYS_S: f64 = 1.5;
 #[derive(Debug)]
 struct BackgroundSnapshot {
     picture: Plane,
-    taken: Timestamp,
+    time: Timestamp,
 }
 
 /// Age at which a snapshot is replaced, s. With half of it a picture is copied twice as often; with
@@ -84,20 +86,20 @@ struct BackgroundSnapshot {
 const SNAPSHOT_AGE_S: f64 = 0.5;
 
 /// Refused images in a row that must agree with each other before the tracker believes them and not
-/// the last accepted one. With one, two late images in a row take the time back and forget the
-/// scene.
+/// the last accepted one. With one, as with half of it, two late images in a row take the time back
+/// and forget the scene.
 const RESYNCHRONISE_AFTER: u32 = 3;
 
 /// When an image was taken, and its sides.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Shot {
     time: Timestamp,
-    size: (usize, usize),
+    sides: [usize; 2],
 }
 
 impl Shot {
     fn follows(self, before: Self) -> bool {
-        self.time > before.time && self.size == before.size
+        self.time > before.time && self.sides == before.sides
     }
 }
 
@@ -163,8 +165,8 @@ impl ImageTracker {
         }
     }
 
-    /// Tells where a target is in the next image (an operator, a cue): the place is taken instead
-    /// of measured. Together with the box it starts the track from two measurements (Herasymenko
+    /// Gives a target's place in the next image (an operator's, a cue): it is used instead of a
+    /// measured one. Together with the box it starts the track from two measurements (Herasymenko
     /// 2021, eqs. 13-14). A track that is not there, or a place that no image has, is ignored.
     pub fn cue(&mut self, id: ImageTrackId, place: ImagePoint) {
         let known = self.followed.iter_mut().find(|followed| followed.id == id);
@@ -173,7 +175,7 @@ impl ImageTracker {
         }
     }
 
-    /// Tells that the camera has been turned since the last image, so that nothing in the next one
+    /// Notes that the camera has been turned since the last image, so that nothing in the next one
     /// is where it was. What was followed is given up, and the numbers of tracks go on.
     pub fn look_elsewhere(&mut self) {
         self.followed.clear();
@@ -204,12 +206,12 @@ impl ImageTracker {
     /// without new, lost, doubtful, noisy or given-up targets, and none at its border, allocates no
     /// memory, but for the detector.
     pub fn step(&mut self, image: &Plane, time: Timestamp) -> &[ImageTrack] {
-        let shot = Shot { time, size: (image.width(), image.height()) };
+        let shot = Shot { time, sides: [image.width(), image.height()] };
         if image.samples().is_empty() || !self.admits(shot) {
             self.refused += 1;
             return &[];
         }
-        let interval = self.pass_time(shot);
+        let interval = self.advance_to(shot);
         let scene_moved = self.register(image, interval);
         self.follow(image, time, interval, scene_moved);
         self.give_up(time);
@@ -220,8 +222,8 @@ impl ImageTracker {
         &self.tracks
     }
 
-    /// Takes the time of an accepted image, and returns the interval since the last one, s.
-    fn pass_time(&mut self, shot: Shot) -> f64 {
+    /// Advances to the time of an accepted image, and returns the interval since the last one, s.
+    fn advance_to(&mut self, shot: Shot) -> f64 {
         let since = self.last.map(|last| shot.time.seconds_since(last.time));
         if since.is_some_and(|since| since > LONGEST_INTERVAL) {
             // Nobody knows what the camera did meanwhile.
@@ -316,7 +318,7 @@ impl ImageTracker {
             return false;
         }
         self.refused_last = None;
-        if self.last.is_some_and(|last| last.size != shot.size) {
+        if self.last.is_some_and(|last| last.sides != shot.sides) {
             // Places in pictures of another size mean nothing.
             self.followed.clear();
         }
@@ -342,16 +344,16 @@ impl ImageTracker {
             .iter()
             .any(|f| matches!(&f.target, Follower::Posterior(t) if t.state.in_snapshot.is_none()));
         let old =
-            self.snapshot.as_ref().is_none_or(|k| time.seconds_since(k.taken) >= SNAPSHOT_AGE_S);
+            self.snapshot.as_ref().is_none_or(|k| time.seconds_since(k.time) >= SNAPSHOT_AGE_S);
         let posterior = self.config.algorithm == Algorithm::Posterior;
         if !posterior || self.followed.is_empty() || !all_seen || !(new || old) {
             return;
         }
         let snapshot = self
             .snapshot
-            .get_or_insert_with(|| BackgroundSnapshot { picture: Plane::default(), taken: time });
+            .get_or_insert_with(|| BackgroundSnapshot { picture: Plane::default(), time });
         snapshot.picture.copy_from(image);
-        snapshot.taken = time;
+        snapshot.time = time;
         for followed in &mut self.followed {
             if let Follower::Posterior(target) = &mut followed.target {
                 target.state.in_snapshot = Some(target.state.last_seen);
@@ -364,21 +366,16 @@ impl ImageTracker {
     /// that was given).
     fn give_up(&mut self, now: Timestamp) {
         let patience = self.config.give_up_after_s;
-        self.followed
-            .retain(|f| f.origin == Origin::Given || now.seconds_since(f.measured_at) <= patience);
+        self.followed.retain(|f| {
+            f.origin == TakenUpBy::Given || now.seconds_since(f.measured_at) <= patience
+        });
         // Such candidates would take the places of others, and cover a target that hovers there.
-        let stays = |f: &Followed| {
-            f.is_candidate() && !f.has_moved() && now.seconds_since(f.since) > STAYS_S
-        };
-        self.followed.retain(|followed| !stays(followed));
+        self.followed.retain(|followed| !followed.stays(now));
         let mut index = 0;
         while index < self.followed.len() {
             let (older, rest) = self.followed.split_at(index);
-            // A track that is lost is not where it is guessed to be.
-            let is_of = |other: &Followed| {
-                !other.target.is_searching() && same(&other.target, &rest[0].target)
-            };
-            let is_double = rest[0].origin != Origin::Given && older.iter().any(is_of);
+            let is_of = |other: &Followed| lies_on(&other.target, &rest[0].target);
+            let is_double = rest[0].origin != TakenUpBy::Given && older.iter().any(is_of);
             let is_known = rest[0].is_candidate()
                 && rest[1..].iter().any(|younger| !younger.is_candidate() && is_of(younger));
             let doubled = is_double || is_known;
@@ -388,6 +385,18 @@ impl ImageTracker {
                 index += 1;
             }
         }
+    }
+}
+
+/// Whether a target lies on another. One that is lost is not where it is guessed to be.
+fn lies_on(one: &Follower, other: &Follower) -> bool {
+    !one.is_searching() && same(one, other)
+}
+
+impl Followed {
+    /// Whether it is a candidate that has stayed in its place for too long.
+    fn stays(&self, now: Timestamp) -> bool {
+        self.is_candidate() && !self.has_moved() && now.seconds_since(self.since) > STAYS_S
     }
 }
 

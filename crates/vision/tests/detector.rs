@@ -269,8 +269,8 @@ fn a_camera_that_turns_away_finds_nothing_in_the_turn_and_the_target_after_it() 
     assert!(seen >= 28, "in {seen} of 30 images");
 }
 
-/// A mount has turned the camera: the target is another place of another scene, and what was followed
-/// before is no track there.
+/// A mount has turned the camera: the target is another place of another scene, and what was
+/// followed before is no track there.
 #[test]
 fn told_that_it_looks_elsewhere_it_begins_anew() {
     fn turned(x: f64, y: f64, time_s: f64) -> f64 {

@@ -134,8 +134,8 @@ fn what_stands_out_of_no_single_image_is_found_again_by_several() {
         let mut tracker = tracker_on([60.0, 60.0]);
         let mut seen = 0;
         for frame in 0..160 {
-            // It is followed for two seconds and a half, hidden for two, and comes out elsewhere. Of
-            // the ten thousand places of an image some look more like it than it does itself.
+            // It is followed for two seconds and a half, hidden for two, and comes out elsewhere.
+            // Of the ten thousand places of an image some look more like it than it does itself.
             let at = match frame {
                 0..60 => [60.0 + 0.5 * frame as f32, 60.0],
                 _ => [150.0 + 0.8 * (frame as f32 - 105.0), 120.0],

@@ -5,14 +5,16 @@ use super::gauge::Gauge;
 use super::model::{CLOCK, POSE_AND_CLOCK};
 use super::noise::Tails;
 use super::normal::{Covariance, NormalEquations, Solution};
-use super::rows::{Cost, ResidualRow, Sink};
+use super::rows::{CostSum, ResidualRow, Sink};
 use super::state::{CameraPriors, Flight, FlightState, Priors};
 use crate::lens;
 
-/// Standard deviations of unknowns of which nothing is known beforehand: wide against anything that
-/// a site has. With half of them the same.
+/// Standard deviation of a rotation of which nothing is known beforehand, rad: wide against
+/// anything that a site has. With half of it the same.
 const WIDE_ROTATION_RAD: f64 = 10.0;
+/// The same of a place, m. With half of it the same.
 const WIDE_M: f64 = 1e4;
+/// The same of a clock's offset, s. With half of it the same.
 const WIDE_S: f64 = 1e4;
 /// Standard deviation of the clock's rate in the stated covariance, where the flight does not tell
 /// the rate: nobody knows which camera is a phone. With [`RATE_SD`](super::state::RATE_SD) a
@@ -70,7 +72,7 @@ impl FlightState {
     }
 
     fn cost_of_rows(&self, model: &AdjustmentModel<'_>) -> f64 {
-        let mut cost = Cost(0.0);
+        let mut cost = CostSum(0.0);
         self.all(model, &mut cost);
         cost.0
     }
@@ -129,8 +131,8 @@ fn hold(unknown: usize, value: f64, sd: f64, sink: &mut impl Sink) {
 /// Steps at most; from a start within a metre and a tenth of a second, five to eight are enough.
 /// With half of it a rough start may end before it has settled, and is used as it is then.
 const MOST_STEPS: usize = 30;
-/// A step that changes the cost (see [`Cost`]) by less than this is the last (all unknowns together
-/// move by a tenth of a deviation then; with half of it the same); ...
+/// A step that changes the cost (see [`CostSum`]) by less than this is the last (all unknowns
+/// together move by a tenth of a deviation then; with half of it the same); ...
 pub(super) const SETTLED: f64 = 0.01;
 /// ... and by this while the noise is still being found: with a hundred unknowns, a tenth of a
 /// deviation each. With half of it rounds take more steps to find the same noise.

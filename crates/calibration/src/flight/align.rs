@@ -1,7 +1,7 @@
 //! Alignment to the survey: a site reconstructed from what cameras saw is brought to its true
 //! place.
 
-use crossfix_geometry::{Pose, turn_between, turn_vector};
+use crossfix_geometry::{Pose, Ray, turn_between, turn_vector};
 use crossfix_message::CameraName;
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
@@ -20,13 +20,19 @@ struct SimilarityTransform {
     to: Point3<f64>,
 }
 
-/// A place of the site as cameras reconstruct it, and as the survey has it.
-type PlacePair = (Point3<f64>, Point3<f64>);
+/// Something of the site in both frames.
+#[derive(Clone, Copy, Debug)]
+struct InBoth<T> {
+    /// As cameras reconstruct it.
+    here: T,
+    /// As the survey has it.
+    there: T,
+}
 
 /// What is known in both frames: that of the reconstruction, and that of the survey.
 struct Correspondences {
-    places: Vec<PlacePair>,
-    rotations: Vec<(Rotation3<f64>, Rotation3<f64>)>,
+    places: Vec<InBoth<Point3<f64>>>,
+    rotations: Vec<InBoth<Rotation3<f64>>>,
     /// Why cameras' own landmarks tell no pose.
     untold: Vec<String>,
 }
@@ -44,39 +50,42 @@ pub(super) fn to_survey(
     let Correspondences { places, rotations, untold } =
         Correspondences::of(state, labels, survey).without_wrong();
     let scale = size(&places).or_else(|| taped(state, labels, survey)).ok_or(untold)?;
-    let (from, to) = if places.is_empty() {
-        (state.cameras[0].centre, Point3::origin())
+    let origins = if places.is_empty() {
+        InBoth { here: state.cameras[0].centre, there: Point3::origin() }
     } else {
         middles(&places)
     };
-    let mut arms = arms(&places, from, to);
+    let mut arms = arms(&places, origins);
     let rotation = if rotations.is_empty() {
         turn(&arms).filter(|_| places.len() >= ENOUGH_PLACES)
     } else {
         // A camera's known pose also tells where its axes point.
         // Axes as long as the longest arm weigh as much in the sum as a place there.
-        let length = arms.iter().map(|(here, _)| here.norm()).fold(1.0, f64::max);
+        let length = arms.iter().map(|arm| arm.here.norm()).fold(1.0, f64::max);
         let axes = [Vector3::x(), Vector3::y(), Vector3::z()].map(|axis| axis * length);
-        let turned = rotations.iter().flat_map(|(here, there)| axes.map(|a| (here * a, there * a)));
-        arms.extend(turned);
+        arms.extend(rotations.iter().flat_map(|InBoth { here, there }| {
+            axes.map(|axis| InBoth { here: here * axis, there: there * axis })
+        }));
         turn(&arms)
     };
     // Too few places for a rotation: upright by the images' rows, then turned to where the places
     // are.
     let rotation = rotation.unwrap_or_else(|| about(&arms, upright(&state.cameras)));
-    Ok((SimilarityTransform { rotation, scale, from, to }.moved(state), scale))
+    let transform = SimilarityTransform { rotation, scale, from: origins.here, to: origins.there };
+    Ok((transform.moved(state), scale))
 }
 
-fn middles(places: &[PlacePair]) -> PlacePair {
-    (middle(places.iter().map(|pair| pair.0)), middle(places.iter().map(|pair| pair.1)))
+fn middles(places: &[InBoth<Point3<f64>>]) -> InBoth<Point3<f64>> {
+    InBoth {
+        here: middle(places.iter().map(|place| place.here)),
+        there: middle(places.iter().map(|place| place.there)),
+    }
 }
 
-fn arms(
-    places: &[PlacePair],
-    from: Point3<f64>,
-    to: Point3<f64>,
-) -> Vec<(Vector3<f64>, Vector3<f64>)> {
-    places.iter().map(|(here, there)| (here - from, there - to)).collect()
+/// The places from an origin.
+fn arms(places: &[InBoth<Point3<f64>>], origins: InBoth<Point3<f64>>) -> Vec<InBoth<Vector3<f64>>> {
+    let InBoth { here: from, there: to } = origins;
+    places.iter().map(|place| InBoth { here: place.here - from, there: place.there - to }).collect()
 }
 
 /// Of more places than these, evenly chosen ones make the triples that are tried: 1140. With half
@@ -94,18 +103,18 @@ const FAR_TURNED_RAD: f64 = 0.2;
 
 impl SimilarityTransform {
     /// The similarity that three places determine; `None` where they lie on a line.
-    fn of_three(three: &[PlacePair]) -> Option<Self> {
-        let (from, to) = middles(three);
-        let rotation = turn(&arms(three, from, to))?;
-        Some(Self { rotation, scale: size(three)?, from, to })
+    fn of_three(three: &[InBoth<Point3<f64>>]) -> Option<Self> {
+        let origins = middles(three);
+        let rotation = turn(&arms(three, origins))?;
+        Some(Self { rotation, scale: size(three)?, from: origins.here, to: origins.there })
     }
 
     fn place(&self, place: Point3<f64>) -> Point3<f64> {
         self.to + self.rotation * (place - self.from) * self.scale
     }
 
-    fn misfit(&self, (here, there): &PlacePair) -> f64 {
-        (self.place(*here) - there).norm()
+    fn misfit(&self, place: &InBoth<Point3<f64>>) -> f64 {
+        (self.place(place.here) - place.there).norm()
     }
 }
 
@@ -117,7 +126,7 @@ impl Correspondences {
         if self.places.len() <= ENOUGH_PLACES {
             return self;
         }
-        let tried: Vec<PlacePair> =
+        let tried: Vec<InBoth<Point3<f64>>> =
             self.places.iter().step_by(self.places.len().div_ceil(TRIED_PLACES)).copied().collect();
         let mut best: Option<(f64, SimilarityTransform)> = None;
         for a in 0..tried.len() {
@@ -135,13 +144,13 @@ impl Correspondences {
             }
         }
         let Some((misfit, shown)) = best else { return self };
-        let (_, to) = middles(&self.places);
-        let spread = linear::median(self.places.iter().map(|(_, there)| (there - to).norm()));
+        let to = middles(&self.places).there;
+        let spread = linear::median(self.places.iter().map(|place| (place.there - to).norm()));
         // FAR times the median misfit, but at least LEAST_FAR of the spread.
         let most = FAR * misfit.max(LEAST_FAR / FAR * spread);
         self.places.retain(|place| shown.misfit(place) <= most);
         // R_there' R R_here is the turn that is left of a pose when the site is moved by R.
-        self.rotations.retain(|(here, there)| {
+        self.rotations.retain(|InBoth { here, there }| {
             turn_vector(&(there.inverse() * shown.rotation * here)).norm() < FAR_TURNED_RAD
         });
         self
@@ -150,7 +159,7 @@ impl Correspondences {
     /// Removes rotations that differ far from what most others say of the site's rotation: those of
     /// cameras that have been knocked since.
     fn leave_turned_out(&mut self) {
-        let site = |(here, there): &(Rotation3<f64>, Rotation3<f64>)| there * here.inverse();
+        let site = |one: &InBoth<Rotation3<f64>>| one.there * one.here.inverse();
         let apart = |a: &Rotation3<f64>, b: &Rotation3<f64>| turn_vector(&(a.inverse() * b)).norm();
         let said: Vec<Rotation3<f64>> = self.rotations.iter().map(site).collect();
         // The medoid: the rotation with the least median distance from all.
@@ -167,40 +176,40 @@ impl Correspondences {
         let mut known = Self { places: Vec::new(), rotations: Vec::new(), untold: Vec::new() };
         for (labels, camera) in labels.iter().zip(&state.cameras) {
             if let Some(place) = survey.place(&labels.name) {
-                known.places.push((camera.centre, place.position));
+                known.places.push(InBoth { here: camera.centre, there: place.position });
             }
             if let Some(earlier) = survey.known(&labels.name) {
-                known.rotations.push((camera.rotation, *earlier.camera.pose().rotation()));
+                let there = *earlier.camera.pose().rotation();
+                known.rotations.push(InBoth { here: camera.rotation, there });
             }
             match by_own_landmarks(labels, survey) {
                 Ok(Some(pose)) => {
-                    known.rotations.push((camera.rotation, *pose.rotation()));
-                    known.places.push((camera.centre, pose.position()));
+                    let there = *pose.rotation();
+                    known.rotations.push(InBoth { here: camera.rotation, there });
+                    known.places.push(InBoth { here: camera.centre, there: pose.position() });
                 }
                 Ok(None) => {}
                 Err(why) => known.untold.push(why),
             }
         }
-        for (landmark, place) in survey.placed_landmarks() {
+        for (landmark, there) in survey.placed_landmarks() {
             let clicks = landmark.clicks.iter();
             let lines: Vec<_> =
                 clicks.filter_map(|click| sight_line(click, state, labels)).collect();
-            known.places.extend(triangulation::place(&lines).map(|(here, _)| (here, place)));
+            let here = triangulation::place(&lines);
+            known.places.extend(here.map(|(here, _)| InBoth { here, there }));
         }
         known
     }
 }
 
-/// The line (a point and a direction) on which a click has its landmark.
-fn sight_line(
-    click: &Click,
-    state: &FlightState,
-    labels: &[CameraLabels],
-) -> Option<(Point3<f64>, Vector3<f64>)> {
+/// The line on which a click has its landmark.
+fn sight_line(click: &Click, state: &FlightState, labels: &[CameraLabels]) -> Option<Ray> {
     let index = labels.iter().position(|camera| camera.name == click.camera)?;
     let direction = lens::direction(&labels[index].intrinsics, click.pixel)?;
     let camera = &state.cameras[index];
-    Some((camera.centre, camera.rotation * direction.normalize()))
+    let direction = camera.rotation * Unit::new_normalize(direction);
+    Some(Ray { origin: camera.centre, direction })
 }
 
 /// A camera's pose by the landmarks in its own picture; `None` where it has too few.
@@ -236,7 +245,7 @@ fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Result<Option<Pos
 
 /// A landmark in the picture of a camera.
 fn in_picture(landmark: &SurveyedLandmark, camera: &CameraName) -> Option<Landmark> {
-    let click = landmark.clicks.iter().find(|click| click.camera == *camera)?;
+    let click = landmark.click_of(camera)?;
     Some(Landmark {
         name: landmark.name.clone(),
         pixel: click.pixel,
@@ -251,11 +260,14 @@ fn middle(places: impl ExactSizeIterator<Item = Point3<f64>>) -> Point3<f64> {
 }
 
 /// Scale from the reconstruction to the survey, by at least two places.
-fn size(places: &[(Point3<f64>, Point3<f64>)]) -> Option<f64> {
-    let pairs = places.iter().enumerate().flat_map(|(k, a)| {
-        places[..k].iter().map(move |b| ((a.0 - b.0).norm(), (a.1 - b.1).norm()))
-    });
-    let (here, there) = pairs.fold((0.0, 0.0), |sum, pair| (sum.0 + pair.0, sum.1 + pair.1));
+fn size(places: &[InBoth<Point3<f64>>]) -> Option<f64> {
+    let (mut here, mut there) = (0.0, 0.0);
+    for (k, a) in places.iter().enumerate() {
+        for b in &places[..k] {
+            here += (a.here - b.here).norm();
+            there += (a.there - b.there).norm();
+        }
+    }
     // Ratio of the summed distances: long ones, which are known better by their share, count for
     // more.
     (here > 0.0 && there > 0.0).then(|| there / here)
@@ -273,13 +285,13 @@ fn taped(state: &FlightState, labels: &[CameraLabels], survey: &Survey) -> Optio
 }
 
 /// The rotation that brings arms over one another best (Kabsch); `None` where they lie on a line.
-fn turn(arms: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Rotation3<f64>> {
+fn turn(arms: &[InBoth<Vector3<f64>>]) -> Option<Rotation3<f64>> {
     /// A second singular value below this share of the first counts as zero. Places beside a line
     /// by 3 % of its length are on it; with half of it errors of places turn the site about that
     /// line.
     const FLAT: f64 = 1e-3;
     // H = sum of there here' = U S V': R = U diag(1, 1, det(U V')) V'.
-    let sum: Matrix3<f64> = arms.iter().map(|(here, there)| there * here.transpose()).sum();
+    let sum: Matrix3<f64> = arms.iter().map(|arm| arm.there * arm.here.transpose()).sum();
     let factors = sum.svd(true, true);
     let (u, v_t) = (factors.u?, factors.v_t?);
     if factors.singular_values[1] < FLAT * factors.singular_values[0] {
@@ -305,17 +317,18 @@ fn upright(cameras: &[CameraUnknowns]) -> Rotation3<f64> {
 }
 
 /// The same, turned about the vertical to where arms point, and tipped by what remains.
-fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rotation3<f64> {
+fn about(arms: &[InBoth<Vector3<f64>>], upright: Rotation3<f64>) -> Rotation3<f64> {
     // The heading that maximises the sum of level scalar products: tan = sum of sines / sum of
     // cosines.
-    let level = arms.iter().map(|(here, there)| ((upright * here).xy(), there.xy()));
+    let level = arms.iter().map(|arm| ((upright * arm.here).xy(), arm.there.xy()));
     let (sine, cosine) = level.fold((0.0, 0.0), |(sine, cosine), (here, there)| {
         (sine + here.perp(&there), cosine + here.dot(&there))
     });
     let turned = Rotation3::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine)) * upright;
     // Places on one line: the longest arm determines the tip best.
-    let longest = arms.iter().max_by(|a, b| a.0.norm_squared().total_cmp(&b.0.norm_squared()));
-    let tip = longest.and_then(|(here, there)| smallest_turn(&(turned * here), there));
+    let longest =
+        arms.iter().max_by(|a, b| a.here.norm_squared().total_cmp(&b.here.norm_squared()));
+    let tip = longest.and_then(|arm| smallest_turn(&(turned * arm.here), &arm.there));
     tip.map_or(turned, |tip| tip * turned)
 }
 

@@ -6,14 +6,15 @@ use super::error::{FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal};
 use super::model::{CameraLabels, CameraUnknowns, FlightLog, frame_time, hours};
 use super::pairs::{self, RelativePose, Sights};
 use super::spline::{KNOT_S, TrajectorySpline};
+use super::start::{self, StartPose};
 use super::state::{CameraPriors, FlightState, Priors, RATE_SD};
 use super::would_fit::WouldFit;
-use super::{start, things, triangulation, would_fit};
+use super::{things, triangulation, would_fit};
 use crate::label_noise::LabelNoise;
 use crate::survey::Survey;
 use crossfix_geometry::turn_vector;
 use crossfix_message::CameraName;
-use nalgebra::{Point3, Rotation3};
+use nalgebra::Rotation3;
 
 /// Labels whose median misfit to the log is above this are not of its target, rad: lens files and
 /// clocks that are not known yet leave up to 4 mrad. With half of it phones are refused.
@@ -36,14 +37,14 @@ const MARGIN_S: f64 = 2.0;
 /// trajectory. With half of it labels are lost where the other cameras have fewer than five a
 /// second.
 const TOGETHER_S: f64 = KNOT_S;
-/// Without a log, this many pairs of cameras are tried as a start, those of least doubt: one that
-/// saw a short or a flat piece of the trajectory leads astray. With half of it such a pair may be
-/// the only one.
+/// Without a log, this many pairs of cameras are tried as a start, those of least range
+/// uncertainty: one that saw a short or a flat piece of the trajectory leads astray. With half of
+/// it such a pair may be the only one.
 const PAIRS_TRIED: usize = 3;
 /// Two relative poses fit alike if the misfit of one is at most this many times the other's: the
 /// two of a flight in a plane fit to within their noise (with half of it only the better one
 /// counts, which may be the wrong one), ...
-const ALIKE_TIMES: f64 = 2.0;
+const AS_GOOD_TIMES: f64 = 2.0;
 /// ... and are different if cameras are turned differently by more than this, rad: starts from two
 /// pairs of cameras that lead to one solution differ by less. With half of it starts of one
 /// solution may count as two, and the flight is refused.
@@ -248,15 +249,13 @@ impl BegunFlight {
 
     /// Whether it fits about as well as the best start.
     fn fits_as(&self, best: &Self) -> bool {
-        self.cameras.len() == best.cameras.len() && self.misfit() <= ALIKE_TIMES * best.misfit()
+        self.cameras.len() == best.cameras.len() && self.misfit() <= AS_GOOD_TIMES * best.misfit()
     }
 
     /// Sum of all cameras' median misfits to the course, rad.
     fn misfit(&self) -> f64 {
-        let of_camera = |(camera, state): (&CameraLabels, &CameraUnknowns)| {
-            start::misfit_of(camera, state, &self.course)
-        };
-        self.cameras.iter().zip(&self.states).map(of_camera).sum()
+        let both = self.cameras.iter().zip(&self.states);
+        both.map(|(camera, state)| start::misfit_of(camera, state, &self.course)).sum()
     }
 }
 
@@ -387,10 +386,10 @@ fn with_cure(
 /// Two cameras to begin with: their possible poses, and the second's clock.
 struct BeginWith<'a> {
     cameras: [&'a CameraLabels; 2],
-    /// Rotation, centre, and the time by the first's clock less that by the camera's own, s.
-    poses: [(Rotation3<f64>, Point3<f64>, f64); 2],
-    /// As [`RelativePose::doubt`].
-    doubt: f64,
+    /// The common time is that of the first's clock.
+    poses: [StartPose; 2],
+    /// As [`RelativePose::range_uncertainty`].
+    range_uncertainty: f64,
     /// Whether the poses are those of an earlier calibration.
     is_known: bool,
 }
@@ -403,11 +402,8 @@ impl<'a> BeginWith<'a> {
     fn of_pair(cameras: [&'a CameraLabels; 2], pair: &RelativePose) -> Self {
         Self {
             cameras,
-            poses: [
-                (Rotation3::identity(), Point3::origin(), 0.0),
-                (pair.first_from_second, pair.centre, pair.ahead_s),
-            ],
-            doubt: pair.doubt,
+            poses: pair.start_poses(),
+            range_uncertainty: pair.range_uncertainty,
             is_known: false,
         }
     }
@@ -418,12 +414,34 @@ impl<'a> BeginWith<'a> {
         survey: &Survey,
     ) -> Option<Self> {
         let pose = |camera: &CameraLabels| Some(survey.known(&camera.name)?.camera.pose());
-        let (a, b) = (pose(cameras[0])?, pose(cameras[1])?);
-        let stand = [a, b].map(|pose| (pose.rotation(), pose.position()));
-        let pair = pairs::known(sights[0], sights[1], stand)?;
-        let poses =
-            [(*a.rotation(), a.position(), 0.0), (*b.rotation(), b.position(), pair.ahead_s)];
-        Some(Self { cameras, poses, doubt: pair.doubt, is_known: true })
+        let both = [pose(cameras[0])?, pose(cameras[1])?];
+        let pair = pairs::known(sights[0], sights[1], both)?;
+        let poses = [(both[0], 0.0), (both[1], pair.ahead_s)].map(|(pose, offset_s)| StartPose {
+            rotation: *pose.rotation(),
+            centre: pose.position(),
+            offset_s,
+        });
+        Some(Self { cameras, poses, range_uncertainty: pair.range_uncertainty, is_known: true })
+    }
+
+    /// All cameras, begun with these two; `None` if what the two saw gives no trajectory.
+    fn begun(&self, cameras: &[&CameraLabels], sights: &[Sights]) -> Option<BegunFlight> {
+        tracing::debug!(
+            "`{}` and `{}` are {:.3} s apart (range uncertainty {:.1e}){}",
+            self.cameras[0].name,
+            self.cameras[1].name,
+            self.poses[1].offset_s,
+            self.range_uncertainty,
+            if self.is_known { ", where they were" } else { "" }
+        );
+        // Their trajectory is not known yet: the clocks' knots are made with it.
+        let mut begun = BegunFlight::new(Course::nowhere());
+        for (camera, pose) in self.cameras.into_iter().zip(self.poses) {
+            let state = start::state(camera, &begun.course, pose);
+            begun.take(camera, Ok(state));
+        }
+        begun.place_the_rest(cameras, sights)?;
+        Some(begun)
     }
 }
 
@@ -440,30 +458,15 @@ fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<BegunFlig
             known.extend(BeginWith::known(both, seen, survey));
         }
     }
-    // A pair of cameras has up to three poses; its least doubt ranks it.
-    let doubt = |ways: &[BeginWith<'_>]| ways.iter().map(|p| p.doubt).fold(f64::INFINITY, f64::min);
-    found.sort_by(|a, b| doubt(a).total_cmp(&doubt(b)));
-    known.sort_by(|a, b| a.doubt.total_cmp(&b.doubt));
+    // A pair of cameras has up to three poses; its least range uncertainty ranks it.
+    let least = |ways: &[BeginWith<'_>]| {
+        ways.iter().map(|p| p.range_uncertainty).fold(f64::INFINITY, f64::min)
+    };
+    found.sort_by(|a, b| least(a).total_cmp(&least(b)));
+    known.sort_by(|a, b| a.range_uncertainty.total_cmp(&b.range_uncertainty));
     let tried = found.into_iter().take(PAIRS_TRIED).flatten();
     let ways = tried.chain(known.into_iter().take(PAIRS_TRIED));
-    let begun = ways.filter_map(|way| {
-        tracing::debug!(
-            "`{}` and `{}` are {:.3} s apart (doubt {:.1e}){}",
-            way.cameras[0].name,
-            way.cameras[1].name,
-            way.poses[1].2,
-            way.doubt,
-            if way.is_known { ", where they were" } else { "" }
-        );
-        // Their trajectory is not known yet: the clocks' knots are made with it.
-        let mut begun = BegunFlight::new(Course::nowhere());
-        for (camera, pose) in way.cameras.into_iter().zip(way.poses) {
-            let state = start::state(camera, &begun.course, pose);
-            begun.take(camera, Ok(state));
-        }
-        begun.place_the_rest(cameras, &sights)?;
-        Some((begun, way.is_known))
-    });
+    let begun = ways.filter_map(|way| Some((way.begun(cameras, &sights)?, way.is_known)));
     let mut begun: Vec<(BegunFlight, bool)> = begun.collect();
     begun.sort_by(|(a, _), (b, _)| {
         // Most cameras first; of as many, the least misfit.

@@ -1,5 +1,7 @@
 //! The target's trajectory before all cameras are known: by a log, or by two cameras.
 
+use std::ops::Range;
+
 use nalgebra::{Point3, Vector3};
 
 use super::adjustment::{self, NEARLY_SETTLED};
@@ -9,10 +11,10 @@ use super::spline::{KNOT_S, TrajectorySpline, Weights};
 use super::state::{Flight, FlightState, Priors, RATE_SD};
 use crate::survey::Survey;
 
-/// Between samples farther apart than this the target's place counts as unknown, s: or than this
-/// many times the median interval. With half of them one lost sample is a gap in a log of one a
-/// second.
+/// Between samples farther apart than this the target's place counts as unknown, s, ...
 const GAP_S: f64 = 1.0;
+/// ... if they are also farther apart than this many times the median interval. With half of both
+/// one lost sample is a gap in a log of one sample per second.
 const GAP_STEPS: f64 = 2.5;
 
 /// A trajectory, with the times at which it is known.
@@ -114,7 +116,7 @@ impl Course {
     }
 
     /// Range of its times, s.
-    pub(super) fn range(&self) -> (f64, f64) {
+    pub(super) fn range(&self) -> Range<f64> {
         self.way.range()
     }
 

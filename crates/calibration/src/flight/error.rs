@@ -30,21 +30,21 @@ pub enum FlightError {
     },
     /// No two cameras saw the target together for long enough.
     #[error(
-        "no two cameras saw the target together for long enough: without a log, two that see it from \
-         different sides are begun with"
+        "no two cameras saw the target together for long enough: without a log, two that see it \
+         from different sides are begun with"
     )]
     NoPair,
     /// What was seen fits two relative poses of the cameras.
     #[error(
-        "the cameras may stand to each other in two ways that fit alike, as the flight lies in a plane: a \
-         third camera that saw it, a flight at several heights, or a log of it tells which"
+        "the cameras may stand to each other in two ways that fit alike, as the flight lies in a \
+         plane: a third camera that saw it, a flight at several heights, or a log of it tells which"
     )]
     TwoWays,
     /// Nothing determines the site's size.
     #[error(
-        "nothing says how large the site is: --log, --positions of two cameras that saw the flight, \
-         --distance between two, or --landmarks: three of them in two cameras' pictures, or four in each \
-         of two cameras'{}",
+        "nothing says how large the site is: --log, --positions of two cameras that saw the \
+         flight, --distance between two, or --landmarks: three of them in two cameras' pictures, \
+         or four in each of two cameras'{}",
         untold.iter().map(|why| format!("; {why}")).collect::<String>()
     )]
     NoSize {
@@ -67,8 +67,8 @@ pub enum Refusal {
     },
     /// Its labels last longer than any flight.
     #[error(
-        "has labels over {hours:.1} h: take one flight, at most {LONGEST_FLIGHT_H} h (a time of them \
-         may be wrong)"
+        "has labels over {hours:.1} h: take one flight, at most {LONGEST_FLIGHT_H} h (a time of \
+         them may be wrong)"
     )]
     LongFlight {
         /// How long.

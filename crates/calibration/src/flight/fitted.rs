@@ -69,8 +69,7 @@ pub(super) fn labels(flight: &Flight<'_>, state: &FlightState, index: usize) -> 
 
 fn fitted_label(state: &FlightState, index: usize, label: &Label) -> Option<FittedLabel> {
     let time_s = state.cameras[index].time_s(label);
-    let weights = state.way.weights(time_s)?;
-    let (_, _, seen) = state.see(index, label)?;
+    let (weights, seen) = state.see(index, label)?;
     Some(FittedLabel {
         own_time_s: label.time_s,
         time_s,

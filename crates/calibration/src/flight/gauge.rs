@@ -18,7 +18,7 @@ use super::state::FlightState;
 /// (s). Rounding errors are ten digits below them, far under the accuracy of the cameras beside the
 /// datum. The clocks' common rate has a prior of its own. With half of them the rough start pulls
 /// four times as hard against what a survey says.
-const HELD: [f64; Datum::WAYS - 1] = [10.0, 10.0, 10.0, 0.1, 0.1, 0.1, 0.1, 1.0];
+const LOOSE_SD: [f64; Datum::WAYS - 1] = [10.0, 10.0, 10.0, 0.1, 0.1, 0.1, 0.1, 1.0];
 
 /// The constraint.
 #[derive(Clone, Debug)]
@@ -31,8 +31,8 @@ pub(super) struct Gauge {
 impl Gauge {
     /// Constraint to a state.
     pub(super) fn of(from: &FlightState) -> Option<Self> {
-        // A turn is weighted by how far it moves a point at this range, m. With half of it the
-        // same: it only decides how much of a difference counts as a turn.
+        /// A turn is weighted by how far it moves a point at this range, m. With half of it the
+        /// same: it only decides how much of a difference counts as a turn.
         const RANGE_M: f64 = 30.0;
         let followers = Followers::of(from);
         let starts = from.starts();
@@ -53,7 +53,7 @@ impl Gauge {
         let moved = DVector::from_vec(pairs.flat_map(|(a, b)| step_between(a, b)).collect());
         // The site's part of the cameras' movements, which alone is constrained.
         let as_a_whole = &self.gain * moved;
-        for (way, sd) in HELD.iter().enumerate() {
+        for (way, sd) in LOOSE_SD.iter().enumerate() {
             let gain = self.gain.row(way);
             let terms = gain.iter().enumerate().filter(|(_, by)| **by != 0.0);
             let row: ResidualRow =
@@ -64,7 +64,7 @@ impl Gauge {
 
     /// Information on the datum that comes from the constraint.
     pub(super) fn information() -> DMatrix<f64> {
-        let held = |way: usize| HELD.get(way).map_or(0.0, |sd| 1.0 / (sd * sd));
-        DMatrix::from_diagonal(&DVector::from_fn(Datum::WAYS, |way, _| held(way)))
+        let weight = |way: usize| LOOSE_SD.get(way).map_or(0.0, |sd| 1.0 / (sd * sd));
+        DMatrix::from_diagonal(&DVector::from_fn(Datum::WAYS, |way, _| weight(way)))
     }
 }

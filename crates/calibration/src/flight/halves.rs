@@ -71,11 +71,10 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &FlightState) -> Option
 
 /// The time that splits all labels in half.
 fn middle(flight: &Flight<'_>, state: &FlightState) -> Option<f64> {
-    let of_camera = |(camera, state): (&CameraLabels, &CameraUnknowns)| {
-        camera.labels.iter().map(|label| state.time_s(label)).collect::<Vec<_>>()
-    };
-    let mut times: Vec<f64> =
-        flight.cameras.iter().zip(&state.cameras).flat_map(of_camera).collect();
+    let mut times = Vec::new();
+    for (camera, state) in flight.cameras.iter().zip(&state.cameras) {
+        times.extend(camera.labels.iter().map(|label| state.time_s(label)));
+    }
     times.sort_unstable_by(f64::total_cmp);
     times.get(times.len() / 2).copied()
 }

@@ -19,10 +19,10 @@ impl Flight<'_> {
     /// An earlier calibration of a camera, if that has the same kind of lens.
     pub(super) fn known(&self, index: usize) -> Option<&CalibratedCamera> {
         let CameraLabels { name, intrinsics, .. } = &self.cameras[index];
-        let is_alike = |known: &&CalibratedCamera| {
-            lens::numbers(known.camera.model().intrinsics()) == lens::numbers(intrinsics)
-        };
-        self.survey.known(name).filter(is_alike)
+        let known = self.survey.known(name)?;
+        let has_same_kind =
+            lens::numbers(known.camera.model().intrinsics()) == lens::numbers(intrinsics);
+        has_same_kind.then_some(known)
     }
 }
 

@@ -22,12 +22,14 @@ pub(super) struct AffineMap {
 impl AffineMap {
     /// The map with the sign that puts most places ahead of the camera.
     fn new(matrix: Matrix3<f64>, shift: Vector3<f64>, pairs: &[DirectionToPlace]) -> Self {
-        let is_ahead = |(direction, place): &&DirectionToPlace| {
-            direction.dot(&(matrix * place.coords + shift)) > 0.0
-        };
-        let ahead = pairs.iter().filter(is_ahead).count();
+        let map = Self { matrix, shift };
+        let ahead = pairs.iter().filter(|pair| map.is_ahead(pair)).count();
         let sign = if 2 * ahead >= pairs.len() { 1.0 } else { -1.0 };
         Self { matrix: matrix * sign, shift: shift * sign }
+    }
+
+    fn is_ahead(&self, (direction, place): &DirectionToPlace) -> bool {
+        direction.dot(&(self.matrix * place.coords + self.shift)) > 0.0
     }
 
     /// Angle between a direction and the direction in which the map has its place, rad.
@@ -164,8 +166,8 @@ impl Normalised {
     fn in_space(&self, pairs: &[DirectionToPlace], weights: &[f64]) -> Option<AffineMap> {
         let sum: SMatrix<f64, 12, 12> =
             squares(pairs.iter().zip(weights).map(|((direction, place), weight)| {
-                let place = self.place(*place);
-                (direction, [place.x, place.y, place.z, 1.0], *weight)
+                let place = self.place(*place).push(1.0).into();
+                WeightedPair { direction, place, weight: *weight }
             }));
         // The eigenvector of the least eigenvalue minimises the sum of squares at unit length.
         let eigen = sum.try_symmetric_eigen(f64::EPSILON, MOST_ITERATIONS)?;
@@ -178,7 +180,7 @@ impl Normalised {
     fn in_plane(&self, pairs: &[DirectionToPlace]) -> Option<AffineMap> {
         let sum: SMatrix<f64, 9, 9> = squares(pairs.iter().map(|(direction, place)| {
             let place = self.place(*place);
-            (direction, [place.x, place.y, 1.0], 1.0)
+            WeightedPair { direction, place: [place.x, place.y, 1.0], weight: 1.0 }
         }));
         let eigen = sum.try_symmetric_eigen(f64::EPSILON, MOST_ITERATIONS)?;
         let least: SVector<f64, 9> =
@@ -204,14 +206,21 @@ impl Normalised {
     }
 }
 
+/// A direction and the homogeneous coordinates of the place that is seen there.
+struct WeightedPair<'a, const H: usize> {
+    direction: &'a Vector3<f64>,
+    place: [f64; H],
+    weight: f64,
+}
+
 /// The sum of `A'A` of the equations `d x (M h) = 0`, for directions d and homogeneous places h
 /// with their weights: with `A = h' (x) [d]x` each term is `h h' (x) [d]x'[d]x`.
 fn squares<'a, const H: usize, const N: usize>(
-    pairs: impl Iterator<Item = (&'a Vector3<f64>, [f64; H], f64)>,
+    pairs: impl Iterator<Item = WeightedPair<'a, H>>,
 ) -> SMatrix<f64, N, N> {
     const { assert!(N == 3 * H) };
     let mut sum = SMatrix::<f64, N, N>::zeros();
-    for (direction, place, weight) in pairs {
+    for WeightedPair { direction, place, weight } in pairs {
         // [d]x'[d]x = |d|^2 I - d d'
         let across = (Matrix3::from_diagonal_element(direction.norm_squared())
             - direction * direction.transpose())

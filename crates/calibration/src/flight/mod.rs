@@ -15,8 +15,8 @@ mod error;
 mod fitted;
 mod gauge;
 mod halves;
-mod held;
 mod known;
+mod known_site;
 mod label_rows;
 mod linear;
 mod model;
@@ -85,7 +85,7 @@ pub fn calibrate_flight(
     }
     result.refused = begun.refused;
     if log.is_none() {
-        held::hold_site(&mut result, survey);
+        known_site::keep_known_site(&mut result, survey);
     }
     Ok(result)
 }

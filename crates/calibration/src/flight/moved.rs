@@ -54,20 +54,25 @@ fn middle(blocks: &[OneSecondMean]) -> (Vector2<f64>, f64) {
 /// The moment that best divides residuals, in order of time, into two parts of one median each, so
 /// that a bird at the beginning or the end does not make a part; `None` with too few blocks.
 pub(super) fn likeliest(labels: &[FittedLabel]) -> Option<MovedAt> {
-    /// Ratio of a normal deviate's standard deviation to its mean absolute value.
-    const BY_MEAN: f64 = 1.253;
     let blocks = blocks(labels);
     let last = blocks.len().checked_sub(LEAST_BLOCKS)?;
-    let divided = (LEAST_BLOCKS..=last).map(|k| {
-        let ((one, left), (other, right)) = (middle(&blocks[..k]), middle(&blocks[k..]));
-        // sd = 1.253 mean |x - median| of normal deviates.
-        let sd = BY_MEAN * (left + right) / blocks.len() as f64;
-        let by_px = (other - one).norm();
-        let deviations = by_px / sd.max(f64::MIN_POSITIVE);
-        (left + right, MovedAt { time_s: blocks[k].time_s, by_px, deviations })
-    });
+    let divided = (LEAST_BLOCKS..=last).map(|k| divided_at(&blocks, k));
     // The division that leaves the least sum of absolute deviations.
     divided.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, moved)| moved)
+}
+
+/// The sum of the absolute deviations from the medians of the blocks before the `k`-th and from it
+/// on, and a move at its time.
+fn divided_at(blocks: &[OneSecondMean], k: usize) -> (f64, MovedAt) {
+    /// Ratio of a normal deviate's standard deviation to its mean absolute value, sqrt(pi / 2).
+    /// With half of it moves would be stated with twice as many deviations.
+    const BY_MEAN: f64 = 1.253;
+    let ((one, left), (other, right)) = (middle(&blocks[..k]), middle(&blocks[k..]));
+    // sd = 1.253 mean |x - median| of normal deviates.
+    let sd = BY_MEAN * (left + right) / blocks.len() as f64;
+    let by_px = (other - one).norm();
+    let deviations = by_px / sd.max(f64::MIN_POSITIVE);
+    (left + right, MovedAt { time_s: blocks[k].time_s, by_px, deviations })
 }
 
 #[cfg(test)]

@@ -189,10 +189,13 @@ fn block_means(residuals: &[(f64, Vector2<f64>)]) -> Vec<Vector2<f64>> {
     let same = |a: &(f64, Vector2<f64>), b: &(f64, Vector2<f64>)| block(a.0) == block(b.0);
     let spans =
         |chunk: &&[(f64, Vector2<f64>)]| chunk[chunk.len() - 1].0 - chunk[0].0 > 0.6 * BLOCK_S;
-    let mean = |chunk: &[(f64, Vector2<f64>)]| {
-        chunk.iter().map(|(_, residual)| residual).sum::<Vector2<f64>>() / chunk.len() as f64
-    };
     residuals.chunk_by(same).filter(spans).map(mean).collect()
+}
+
+/// The mean of residuals with their times.
+fn mean(residuals: &[(f64, Vector2<f64>)]) -> Vector2<f64> {
+    let sum = residuals.iter().map(|(_, residual)| residual).sum::<Vector2<f64>>();
+    sum / residuals.len() as f64
 }
 
 /// Share of the variance of an error with correlation time T that is left in the mean over a block

@@ -102,7 +102,7 @@ impl Solution {
 impl Covariance {
     /// Variance of a linear combination of the chain's unknowns, all within the band's width, the
     /// others fixed.
-    pub(super) fn variance_held(&self, terms: &[Derivative]) -> f64 {
+    pub(super) fn variance_with_others_fixed(&self, terms: &[Derivative]) -> f64 {
         let covariance = |i: usize, j: usize| self.band[i.min(j) * self.width + i.abs_diff(j)];
         let mut sum = 0.0;
         for (at, &(i, x)) in terms.iter().enumerate() {
@@ -126,7 +126,7 @@ impl Covariance {
         }
         // Law of total variance: c' Z c with the others fixed, plus g' P g, where g is the
         // combination's total derivative by the others and P their covariance.
-        self.variance_held(&of_chain) + by_others.dot(&(&self.others * &by_others))
+        self.variance_with_others_fixed(&of_chain) + by_others.dot(&(&self.others * &by_others))
     }
 
     /// Covariance of all unknowns outside the chain.
@@ -384,14 +384,14 @@ mod tests {
         assert!((&solution.step - expected).amax() < 1e-9);
         let covariance = dense.clone().try_inverse().unwrap();
         let marginal = covariance.view((CHAIN, CHAIN), (OTHERS, OTHERS));
-        let held = dense.view((0, 0), (CHAIN, CHAIN)).into_owned().try_inverse().unwrap();
+        let inverse = dense.view((0, 0), (CHAIN, CHAIN)).into_owned().try_inverse().unwrap();
         let found = solution.covariance().unwrap();
         assert!((found.others() - marginal).amax() < 1e-9);
         let sum = |terms: &[Derivative], of: &DMatrix<f64>| -> f64 {
             terms.iter().flat_map(|a| terms.iter().map(|b| a.1 * b.1 * of[(a.0, b.0)])).sum()
         };
         let terms = [(7, 0.5), (9, -2.0), (12, 1.0)];
-        assert!((found.variance_held(&terms) - sum(&terms, &held)).abs() < 1e-9);
+        assert!((found.variance_with_others_fixed(&terms) - sum(&terms, &inverse)).abs() < 1e-9);
         let terms = [(7, 0.5), (CHAIN + 2, 0.7), (9, -2.0), (12, 1.0), (CHAIN, -0.3)];
         assert!((found.variance(&terms) - sum(&terms, &covariance)).abs() < 1e-9);
     }

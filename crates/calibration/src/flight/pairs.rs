@@ -4,17 +4,22 @@
 //! by eight points is computed; the offset that fits best gives the relative pose and where the
 //! target was.
 
+use std::ops::Range;
+
+use crossfix_geometry::Pose;
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
-use super::model::CameraLabels;
-use super::model::frame_time;
+use super::model::{CameraLabels, Label, frame_time};
 use super::plane;
+use super::start::StartPose;
 use crate::lens;
 
 /// Offsets of the clocks are tried in steps of this, s, and then in ever finer ones about the best.
 /// At 10 m/s and 40 m the best of the first steps is 0.03 rad off at most; with twice as much it
 /// may not stand out.
 const STEP_S: f64 = 0.25;
+/// The finer steps, s, the last of which is how well the offset is known to begin with. With half
+/// of them the same, at more tries: the adjustment finds the rest.
 const FINER: [f64; 3] = [0.05, 0.01, 0.002];
 /// Labels used in one try. With half of it cameras that share only half of their time find no pair,
 /// as they need 40 in common.
@@ -28,10 +33,10 @@ const LEAST_SHARE: f64 = 0.3;
 /// Sight lines needed to tell whether those of a known relative pose meet. With half of it seven
 /// lines may meet by chance, and a bird's piece is joined to the target's.
 const LEAST_MET: usize = 15;
-/// Between two labels farther apart than this the direction is taken as unknown, s: or than this
-/// many of the camera's frames. With half of them labels count for nothing wherever three in a row
-/// are lost, at 30 frames a second.
+/// Between two labels farther apart than this the direction counts as unknown, s, ...
 const GAP_S: f64 = 0.2;
+/// ... if they are also farther apart than this many of the camera's frames. With half of both
+/// labels count for nothing wherever three in a row are lost, at 30 frames per second.
 const GAP_FRAMES: f64 = 1.5;
 /// Sight lines that meet at a smaller angle than this tell no range, rad. Lens files that are off
 /// by 4 mrad put such ranges off by 8 %; with half of it by 16 %.
@@ -54,10 +59,12 @@ pub(super) struct Sights {
 
 impl Sights {
     pub(super) fn of(camera: &CameraLabels) -> Self {
-        let seen = |label: &super::Label| {
-            Some((label.time_s, lens::direction(&camera.intrinsics, label.pixel)?.normalize()))
-        };
-        let (times_s, directions) = camera.labels.iter().filter_map(seen).unzip();
+        let direction = |label: &Label| lens::direction(&camera.intrinsics, label.pixel);
+        let seen = camera
+            .labels
+            .iter()
+            .filter_map(|label| Some((label.time_s, direction(label)?.normalize())));
+        let (times_s, directions) = seen.unzip();
         let gap_s = GAP_S.max(GAP_FRAMES * frame_time(camera));
         Self { times_s, directions, gap_s }
     }
@@ -65,10 +72,8 @@ impl Sights {
     /// The directions of several pieces of one camera's labels, in order of time.
     pub(super) fn together(pieces: &[&Self]) -> Self {
         let gap_s = pieces.iter().map(|piece| piece.gap_s).fold(0.0, f64::max);
-        let seen = |piece: &&Self| {
-            piece.times_s.iter().copied().zip(piece.directions.iter().copied()).collect::<Vec<_>>()
-        };
-        let mut all: Vec<(f64, Vector3<f64>)> = pieces.iter().flat_map(seen).collect();
+        let mut all: Vec<(f64, Vector3<f64>)> =
+            pieces.iter().flat_map(|piece| piece.timed()).collect();
         all.sort_by(|a, b| a.0.total_cmp(&b.0));
         let (times_s, directions) = all.into_iter().unzip();
         Self { times_s, directions, gap_s }
@@ -90,16 +95,29 @@ impl Sights {
         (to - from <= self.gap_s).then(|| between.normalize())
     }
 
-    pub(super) fn span(&self) -> Option<(f64, f64)> {
-        Some((*self.times_s.first()?, *self.times_s.last()?))
+    /// From the first label to the last, by the camera's own clock, s.
+    pub(super) fn span(&self) -> Option<Range<f64>> {
+        Some(*self.times_s.first()?..*self.times_s.last()?)
     }
 
     /// Times and directions of labels, evenly spread, at most `most`.
     fn times(&self, most: usize) -> impl Iterator<Item = (f64, Vector3<f64>)> {
         let stride = self.times_s.len().div_ceil(most).max(1);
-        let seen = self.times_s.iter().copied().zip(self.directions.iter().copied());
-        seen.step_by(stride)
+        self.timed().step_by(stride)
     }
+
+    fn timed(&self) -> impl Iterator<Item = (f64, Vector3<f64>)> {
+        self.times_s.iter().copied().zip(self.directions.iter().copied())
+    }
+}
+
+/// The second camera's frame from the first's: a direction `a` to a place is `R a + t` in the
+/// second's.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct SecondFromFirst {
+    pub(super) rotation: Matrix3<f64>,
+    /// In any unit of length.
+    pub(super) shift: Vector3<f64>,
 }
 
 /// Relative pose and clock offset of two cameras.
@@ -113,7 +131,7 @@ pub(super) struct RelativePose {
     /// Relative uncertainty of ranges: the median angle by which sight lines miss each other,
     /// divided by the median angle at which they meet and by the root of how many there are. Less
     /// is better.
-    pub(super) doubt: f64,
+    pub(super) range_uncertainty: f64,
 }
 
 /// Directions that both see at a clock offset, in the first's frame and in the second's.
@@ -163,38 +181,43 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
 /// Possible relative poses of two cameras: a flight in a plane allows two. Empty where they saw too
 /// little in common.
 pub(super) fn find(first: &Sights, second: &Sights) -> Vec<RelativePose> {
-    let Some((ahead_s, misfit_rad)) = offset(first, second, |seen| essential(seen).1) else {
+    let Some(offset) = offset(first, second, |seen| essential(seen).1) else {
         return Vec::new();
     };
-    let seen = common(first, second, ahead_s);
-    let in_space = decomposed(&seen, ahead_s, misfit_rad);
-    in_space.into_iter().chain(in_plane(&seen, ahead_s, misfit_rad)).collect()
+    let seen = common(first, second, offset.ahead_s);
+    decomposed(&seen, offset).into_iter().chain(in_plane(&seen, offset)).collect()
 }
 
 /// The clock offset of two cameras whose relative pose is known. `None` where what they saw does
 /// not fit that pose, or is too little.
-pub(super) fn known(
-    first: &Sights,
-    second: &Sights,
-    [a, b]: [(&Rotation3<f64>, Point3<f64>); 2],
-) -> Option<RelativePose> {
-    let second_from_first = (b.0.inverse() * a.0).into_inner();
-    let shift = b.0.inverse() * (a.1 - b.1);
+pub(super) fn known(first: &Sights, second: &Sights, [a, b]: [&Pose; 2]) -> Option<RelativePose> {
+    let second_from_first = b.rotation().inverse();
+    let rotation = (second_from_first * a.rotation()).into_inner();
+    let shift = second_from_first * (a.position() - b.position());
     // E = [t]x R, with the second's frame from the first's: b ~ R a + t.
-    let matrix = shift.cross_matrix() * second_from_first;
-    let (ahead_s, misfit_rad) = offset(first, second, |seen| misfit(&matrix, seen))?;
-    let seen = common(first, second, ahead_s);
-    let unit = shift.try_normalize(1e-9)?;
-    Some(RelativePose::of((second_from_first, unit), &seen, ahead_s, misfit_rad)?.1)
+    let matrix = shift.cross_matrix() * rotation;
+    let offset = offset(first, second, |seen| misfit(&matrix, seen))?;
+    let seen = common(first, second, offset.ahead_s);
+    let shift = shift.try_normalize(1e-9)?;
+    Some(RelativePose::of(&SecondFromFirst { rotation, shift }, &seen, offset)?.1)
 }
 
-/// The clock offset (s) at which what both see fits best, and its misfit.
+/// An offset of two cameras' clocks, and how well what both see fits with it.
+#[derive(Clone, Copy, Debug)]
+struct TriedOffset {
+    /// As [`RelativePose::ahead_s`].
+    ahead_s: f64,
+    /// Median angle by which what both see misses, rad.
+    misfit_rad: f64,
+}
+
+/// The clock offset at which what both see fits best.
 fn offset(
     first: &Sights,
     second: &Sights,
     misfit_of: impl Fn(&[[Vector3<f64>; 2]]) -> f64,
-) -> Option<(f64, f64)> {
-    let ((from, to), (other_from, other_to)) = (first.span()?, second.span()?);
+) -> Option<TriedOffset> {
+    let (own, other) = (first.span()?, second.span()?);
     let fewer = first.times_s.len().min(second.times_s.len());
     // Of the tried labels of the first, as many as correspond to that share of the fewer labels.
     let share = LEAST_SHARE * fewer as f64 / first.times_s.len() as f64;
@@ -202,35 +225,36 @@ fn offset(
     let enough = LEAST_COMMON.max((share * tried as f64) as usize);
     let seen = |ahead_s| Some(common(first, second, ahead_s)).filter(|seen| seen.len() >= enough);
     let misfit = |ahead_s| seen(ahead_s).map_or(f64::INFINITY, |seen| misfit_of(&seen));
-    let (least, most) = (from - other_to, to - other_from);
+    let (least, most) = (own.start - other.end, own.end - other.start);
     let steps = ((most - least) / STEP_S) as usize;
     let offsets_s = (0..=steps).map(|k| least + k as f64 * STEP_S);
-    let mut best = best_offset((0.0, f64::INFINITY), offsets_s, misfit);
+    let nothing = TriedOffset { ahead_s: 0.0, misfit_rad: f64::INFINITY };
+    let mut best = best_offset(nothing, offsets_s, misfit);
     let mut coarser = STEP_S;
     for step in FINER {
-        let about = best.0;
+        let about = best.ahead_s;
         // One coarser step to either side.
         let reach = (coarser / step) as i32;
         let offsets_s = (-reach..=reach).map(|k| about + f64::from(k) * step);
         best = best_offset(best, offsets_s, misfit);
         coarser = step;
     }
-    best.1.is_finite().then_some(best)
+    best.misfit_rad.is_finite().then_some(best)
 }
 
-/// The best of these offsets and one that is known, each with its misfit.
+/// The best of these offsets and one that has been tried.
 fn best_offset(
-    known: (f64, f64),
+    known: TriedOffset,
     offsets_s: impl Iterator<Item = f64>,
     misfit: impl Fn(f64) -> f64,
-) -> (f64, f64) {
-    let tried = offsets_s.map(|ahead_s| (ahead_s, misfit(ahead_s)));
-    tried.fold(known, |best, other| if other.1 < best.1 { other } else { best })
+) -> TriedOffset {
+    let tried = offsets_s.map(|ahead_s| TriedOffset { ahead_s, misfit_rad: misfit(ahead_s) });
+    tried.fold(known, |best, one| if one.misfit_rad < best.misfit_rad { one } else { best })
 }
 
 /// Of the four poses that an essential matrix allows, the one with most of the target ahead of both
 /// cameras.
-fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Option<RelativePose> {
+fn decomposed(seen: &[[Vector3<f64>; 2]], offset: TriedOffset) -> Option<RelativePose> {
     // E = U diag(1, 1, 0) V': R = U W V' or U W' V' with W a quarter turn about z, and t = +-u3.
     let factors = essential(seen).0.svd(true, true);
     let (mut u, mut v_t) = (factors.u?, factors.v_t?);
@@ -245,27 +269,38 @@ fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Opti
     // u3' E = 0: the base line, whose sign and length E does not tell.
     let along: Vector3<f64> = u.column(2).into_owned();
     let poses = [quarter, quarter.transpose()].into_iter().flat_map(|quarter| {
-        let second_from_first = u * quarter * v_t;
-        [along, -along].map(|shift| (second_from_first, shift))
+        let rotation = u * quarter * v_t;
+        [along, -along].map(|shift| SecondFromFirst { rotation, shift })
     });
-    let pairs = poses.filter_map(|pose| RelativePose::of(pose, seen, ahead_s, misfit_rad));
+    let pairs = poses.filter_map(|pose| RelativePose::of(&pose, seen, offset));
     pairs.max_by_key(|(ahead, _)| *ahead).map(|(_, pair)| pair)
 }
 
 /// The poses of a flight in a plane, if a plane explains it about as well.
-fn in_plane(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Vec<RelativePose> {
+fn in_plane(seen: &[[Vector3<f64>; 2]], offset: TriedOffset) -> Vec<RelativePose> {
     let Some((matrix, in_plane_rad)) = plane::homography(seen) else { return Vec::new() };
     // A plane has fewer free numbers: it must not fit much worse than the essential matrix.
-    if in_plane_rad > PLANE_TIMES * misfit_rad {
+    if in_plane_rad > PLANE_TIMES * offset.misfit_rad {
         return Vec::new();
     }
-    let pairs = plane::poses(&matrix, seen).into_iter().filter_map(|(turn, shift)| {
-        RelativePose::of((turn, shift.try_normalize(1e-9)?), seen, ahead_s, in_plane_rad)
+    let offset = TriedOffset { misfit_rad: in_plane_rad, ..offset };
+    let pairs = plane::poses(&matrix, seen).into_iter().filter_map(|pose| {
+        let shift = pose.shift.try_normalize(1e-9)?;
+        RelativePose::of(&SecondFromFirst { shift, ..pose }, seen, offset)
     });
     pairs.map(|(_, pair)| pair).collect()
 }
 
 impl RelativePose {
+    /// The poses of the two cameras in the first's frame, by the first's clock.
+    pub(super) fn start_poses(&self) -> [StartPose; 2] {
+        let (rotation, centre) = (self.first_from_second, self.centre);
+        [
+            StartPose { rotation: Rotation3::identity(), centre: Point3::origin(), offset_s: 0.0 },
+            StartPose { rotation, centre, offset_s: self.ahead_s },
+        ]
+    }
+
     /// The median angle by which the two cameras' sight lines pass each other, rad; `None` where
     /// too few are simultaneous.
     pub(super) fn aside(&self, first: &Sights, second: &Sights) -> Option<f64> {
@@ -276,22 +311,22 @@ impl RelativePose {
         (seen.len() >= LEAST_MET).then(|| misfit(&matrix, &seen))
     }
 
-    /// The pair for a rotation and a unit shift from the first camera to the second, with the
-    /// number of places that lie ahead of both; `None` if less than half do.
+    /// The pair for a rotation and a shift of length one, with the number of places that lie ahead
+    /// of both; `None` if less than half do.
     fn of(
-        (second_from_first, shift): (Matrix3<f64>, Vector3<f64>),
+        SecondFromFirst { rotation, shift }: &SecondFromFirst,
         seen: &[[Vector3<f64>; 2]],
-        ahead_s: f64,
-        misfit_rad: f64,
+        TriedOffset { ahead_s, misfit_rad }: TriedOffset,
     ) -> Option<(usize, Self)> {
         // b ~ R a + t has its zero, the second's centre, at a = -R' t.
-        let centre = Point3::from(-second_from_first.tr_mul(&shift) * BASE_M);
-        let rotation = Rotation3::from_matrix_unchecked(second_from_first.transpose());
-        let mut pair = Self { ahead_s, first_from_second: rotation, centre, doubt: 0.0 };
+        let centre = Point3::from(-rotation.tr_mul(shift) * BASE_M);
+        let first_from_second = Rotation3::from_matrix_unchecked(rotation.transpose());
+        let mut pair = Self { ahead_s, first_from_second, centre, range_uncertainty: 0.0 };
         let parallaxes: Vec<f64> = seen.iter().filter_map(|seen| pair.parallax(seen)).collect();
         let ahead = parallaxes.len();
         // sd(r) / r of two lines is their misfit over the angle at which they meet.
-        pair.doubt = misfit_rad / median(parallaxes.into_iter()) / (ahead as f64).sqrt();
+        pair.range_uncertainty =
+            misfit_rad / median(parallaxes.into_iter()) / (ahead as f64).sqrt();
         (2 * ahead >= seen.len()).then_some((ahead, pair))
     }
 

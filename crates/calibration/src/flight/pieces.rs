@@ -10,7 +10,7 @@ use super::model::{CameraLabels, Label};
 /// fast targets near by fall into pieces, with twice as much a bird continues where the target was.
 const STEP: f64 = 0.03;
 /// A piece ends after this many frames without a label. With half of it a target that is hidden for
-/// a fifth of a second, at 30 frames a second, is cut in two.
+/// a fifth of a second, at 30 frames per second, is cut in two.
 const FRAMES: f64 = 10.0;
 /// The longest pieces that together have this share of all labels are taken: a third may be of
 /// other things. With half of it a start may have only one straight piece of the flight to go by.
@@ -21,11 +21,11 @@ const SHARE: f64 = 0.67;
 const LEAST: usize = 30;
 
 /// A piece under construction: indices of its labels among all.
-struct Piece {
+struct LabelPiece {
     labels: Vec<usize>,
 }
 
-impl Piece {
+impl LabelPiece {
     /// Distance of a label from the piece's last one, as a share of the distance allowed; `None` if
     /// that is exceeded.
     fn away(&self, labels: &[Label], next: &Label, step_px: f64, frame_s: f64) -> Option<f64> {
@@ -82,7 +82,7 @@ const LOST_S: f64 = 5.0;
 /// little while it was lost.
 const ASTRAY: f64 = 0.05;
 /// The speed of a thing in the image is taken from its first and last labels, this many of each.
-/// With half of it the same: at 30 frames a second half a pixel in each then grows to 20 pixels
+/// With half of it the same: at 30 frames per second half a pixel in each then grows to 20 pixels
 /// over five seconds, where hundreds are allowed.
 const PACE: usize = 10;
 
@@ -135,8 +135,8 @@ fn pace(labels: &[Label]) -> Option<Vector2<f64>> {
     Some((in_image(to) - in_image(from)) / (to.time_s - from.time_s))
 }
 
-fn cut(labels: &[Label], step_px: f64, frame_s: f64) -> Vec<Piece> {
-    let (mut open, mut ended): (Vec<Piece>, Vec<Piece>) = (Vec::new(), Vec::new());
+fn cut(labels: &[Label], step_px: f64, frame_s: f64) -> Vec<LabelPiece> {
+    let (mut open, mut ended): (Vec<LabelPiece>, Vec<LabelPiece>) = (Vec::new(), Vec::new());
     for (index, label) in labels.iter().enumerate() {
         ended.extend(open.extract_if(.., |piece| piece.is_over(labels, label.time_s, frame_s)));
         let nearest = open
@@ -146,7 +146,7 @@ fn cut(labels: &[Label], step_px: f64, frame_s: f64) -> Vec<Piece> {
         match nearest {
             Some((_, piece)) => piece.labels.push(index),
             // Near no piece's last label: a new thing.
-            None => open.push(Piece { labels: vec![index] }),
+            None => open.push(LabelPiece { labels: vec![index] }),
         }
     }
     ended.extend(open);

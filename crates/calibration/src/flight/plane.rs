@@ -3,9 +3,11 @@
 
 use nalgebra::{Matrix3, SMatrix, Vector3};
 
+use super::pairs::SecondFromFirst;
+
 /// Eigenvalues nearer together than this are equal: the cameras stand in one place. With half of it
 /// the same.
-const ALIKE: f64 = 1e-6;
+const EQUAL: f64 = 1e-6;
 
 /// The homography `b ~ H a` from the first camera's directions to the second's, for places in a
 /// plane, and the median angle by which it misses, rad.
@@ -31,10 +33,7 @@ pub(super) fn homography(seen: &[[Vector3<f64>; 2]]) -> Option<(Matrix3<f64>, f6
 /// Possible rotation and shift (in units of the plane's distance) of the second camera by a
 /// homography: of the four those with all places ahead (Ma, Soatto, Kosecka and Sastry 2004,
 /// section 5.3.3).
-pub(super) fn poses(
-    matrix: &Matrix3<f64>,
-    seen: &[[Vector3<f64>; 2]],
-) -> Vec<(Matrix3<f64>, Vector3<f64>)> {
+pub(super) fn poses(matrix: &Matrix3<f64>, seen: &[[Vector3<f64>; 2]]) -> Vec<SecondFromFirst> {
     let mut values = matrix.singular_values();
     values.as_mut_slice().sort_unstable_by(f64::total_cmp);
     // H = R + t n'/d has the middle singular value one.
@@ -44,28 +43,40 @@ pub(super) fn poses(
     order.sort_unstable_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
     let [most, _, least] = order.map(|k| eigen.eigenvalues[k]);
     let [v1, v2, v3] = order.map(|k| eigen.eigenvectors.column(k).into_owned());
-    if most - least < ALIKE {
+    if most - least < EQUAL {
         return Vec::new();
     }
     let scale = (most - least).sqrt();
     let (along, across) =
         ((1.0 - least).max(0.0).sqrt() / scale, (most - 1.0).max(0.0).sqrt() / scale);
-    let found = [across, -across].into_iter().flat_map(|across| {
-        // A unit vector in the plane spanned by v1 and v3 whose length H keeps, as it does that of
-        // v2.
-        let u = v1 * along + v3 * across;
-        let normal = v2.cross(&u);
-        // R takes v2 and u to their images under H, and their cross product to that of the images;
-        // then t n' = H - R.
-        let before = Matrix3::from_columns(&[v2, u, normal]);
-        let (hv, hu) = (unit * v2, unit * u);
-        let after = Matrix3::from_columns(&[hv, hu, hv.cross(&hu)]);
-        let turn = after * before.transpose();
-        let shift = (unit - turn) * normal;
-        [(turn, shift, normal), (turn, -shift, -normal)]
-    });
-    let ahead = found.filter(|(_, _, normal)| is_ahead(normal, seen));
-    ahead.map(|(turn, shift, _)| (turn, shift)).collect()
+    // Unit vectors in the plane spanned by v1 and v3 whose length H keeps, as it does that of v2.
+    let kept = [across, -across].map(|across| v1 * along + v3 * across);
+    let found = kept.into_iter().flat_map(|u| poses_by_kept(&unit, v2, u));
+    found.filter(|pose| is_ahead(&pose.normal, seen)).map(|pose| pose.second_from_first).collect()
+}
+
+/// A pose that a homography allows.
+struct PoseByPlane {
+    second_from_first: SecondFromFirst,
+    /// The plane's normal in the first camera's frame.
+    normal: Vector3<f64>,
+}
+
+/// The two poses, of opposite normals, by a homography of middle singular value one and two unit
+/// vectors whose length it keeps.
+fn poses_by_kept(unit: &Matrix3<f64>, v: Vector3<f64>, u: Vector3<f64>) -> [PoseByPlane; 2] {
+    let normal = v.cross(&u);
+    // R takes v and u to their images under H, and their cross product to that of the images; then
+    // t n' = H - R.
+    let before = Matrix3::from_columns(&[v, u, normal]);
+    let (hv, hu) = (unit * v, unit * u);
+    let after = Matrix3::from_columns(&[hv, hu, hv.cross(&hu)]);
+    let rotation = after * before.transpose();
+    let shift = (unit - rotation) * normal;
+    [(shift, normal), (-shift, -normal)].map(|(shift, normal)| PoseByPlane {
+        second_from_first: SecondFromFirst { rotation, shift },
+        normal,
+    })
 }
 
 /// Whether nearly all places lie ahead of the first camera, if this is the normal of their plane.
@@ -98,9 +109,9 @@ mod tests {
         let poses = poses(&matrix, &seen);
         assert!((1..=2).contains(&poses.len()), "{}", poses.len());
         let shift = turn * -centre.coords;
-        let is_true = |(found, along): &(Matrix3<f64>, Vector3<f64>)| {
-            (found - turn.matrix()).norm() < 1e-6
-                && along.normalize().dot(&shift.normalize()) > 1.0 - 1e-9
+        let is_true = |found: &SecondFromFirst| {
+            (found.rotation - turn.matrix()).norm() < 1e-6
+                && found.shift.normalize().dot(&shift.normalize()) > 1.0 - 1e-9
         };
         assert!(poses.iter().any(is_true), "{poses:?}");
     }

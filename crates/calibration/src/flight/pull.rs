@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, Matrix3, Vector3};
 
 use super::model::CLOCK;
 use super::normal::NormalEquations;
-use super::rows::Cost;
+use super::rows::CostSum;
 use super::spline::{KNOT_S, SPAN};
 use super::state::{Flight, FlightState, Priors};
 
@@ -26,7 +26,7 @@ impl FlightState {
         if self.cameras.is_empty() {
             return 0.0;
         }
-        let mut cost = Cost(0.0);
+        let mut cost = CostSum(0.0);
         self.jerk_rows(priors, &mut cost);
         // With the power that is estimated from the trajectory each row counts one; those of a
         // rough start count more and would blow the site up.

@@ -179,7 +179,7 @@ fn camera_result(
     Some(CameraResult {
         name: flight.cameras[index].name.clone(),
         camera: Camera::new(camera.intrinsics, pose).ok()?,
-        pose_covariance: at.pose_with_lens_held(lens::numbers(&camera.intrinsics))? * factor,
+        pose_covariance: at.pose_given_lens(lens::numbers(&camera.intrinsics))? * factor,
         // A factor on both covariances: the regression of pose on lens stays.
         lens: at.lens(lens::numbers(&camera.intrinsics), factor)?,
         clock: clock_result(flight, adjusted, index, prior.wander),
@@ -254,14 +254,14 @@ impl CameraBlock<'_> {
 
     /// The pose's covariance with the lens fixed at its estimate: what pose and lens may both be
     /// off by without a difference in the image is no error of a bearing.
-    fn pose_with_lens_held(&self, lens: usize) -> Option<Matrix6<f64>> {
+    fn pose_given_lens(&self, lens: usize) -> Option<Matrix6<f64>> {
         let pose = self.part(0, 6, 0, 6);
         let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
         let of_lens = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
         // C(pose) - C(pose, lens) C(lens)^-1 C(lens, pose)
-        let held = pose - &tied * of_lens.cholesky()?.solve(&tied.transpose());
-        let held = (&held + held.transpose()) * 0.5;
-        Some(Matrix6::from_column_slice(held.as_slice()))
+        let without_lens = pose - &tied * of_lens.cholesky()?.solve(&tied.transpose());
+        let without_lens = (&without_lens + without_lens.transpose()) * 0.5;
+        Some(Matrix6::from_column_slice(without_lens.as_slice()))
     }
 }
 

@@ -18,9 +18,10 @@ pub(super) trait Sink {
 }
 
 /// The summed cost of rows: twice their negative log likelihood (see [`Tails::loss`]).
-pub(super) struct Cost(pub(super) f64);
+pub(super) struct CostSum(pub(super) f64);
 
-impl Sink for Cost {
+impl Sink for CostSum {
+    /// A sum of costs needs no derivatives.
     const TAKES_TERMS: bool = false;
 
     fn take(&mut self, rows: &[ResidualRow], tails: Tails) {

@@ -12,11 +12,13 @@ use crate::label_noise::LabelNoise;
 /// Rounds in which deviations and powers are estimated beside the unknowns. With half of it a
 /// steady clock's wander may not have come down from the large value that it begins with.
 const ROUNDS: usize = 6;
-/// Prior of a clock's wander, s^2/s: the usual value, 0.03 ms after a second, counts as two steps
-/// that were observed; the least is a crystal's. With half as many steps chance decides where
-/// labels tell of few; with half of the least the same.
+/// Usual value of a clock's wander, s^2/s: 0.03 ms after a second. With half of it clocks of which
+/// labels say little are taken to be 1.4 times steadier.
 const USUAL_WANDER: f64 = 1e-9;
+/// The usual value counts as this many steps that were observed. With half as many chance decides
+/// where labels show few.
 const USUAL_STEPS: f64 = 2.0;
+/// Least wander, s^2/s: a good crystal's. With half of it the same.
 const LEAST_WANDER: f64 = 1e-12;
 /// Extrapolation of the wander from round to round: the value found is multiplied again by the
 /// factor by which it changed, but by this at most. With half of it the rounds end before a value
@@ -65,7 +67,9 @@ fn learnt(flight: &Flight<'_>, adjusted: &AdjustedFlight, priors: &Priors) -> Pr
         let noise = before.filter(|before| before.sd_px() > noise.sd_px()).unwrap_or(noise);
         let wander = wander(adjusted, index, priors.cameras[index].wander);
         tracing::debug!(
-            "camera `{}`: noise {:.3} px and {:.3} px lasting {:.2} s ({:.3} px explained), wander {:.3} ms/sqrt(s), rate {:.2e}, read-out {:.1} ms, focal ratio {:.4}, centre {:.2}",
+            "camera `{}`: noise {:.3} px and {:.3} px lasting {:.2} s ({:.3} px explained), \
+             wander {:.3} ms/sqrt(s), rate {:.2e}, read-out {:.1} ms, focal ratio {:.4}, centre \
+             {:.2}",
             flight.cameras[index].name,
             noise.white_px,
             noise.lasting_px,
@@ -89,7 +93,7 @@ pub(super) fn residuals(
     index: usize,
 ) -> Vec<(f64, Vector2<f64>)> {
     let labels = flight.cameras[index].labels.iter();
-    labels.filter_map(|label| Some((label.time_s, state.see(index, label)?.2.residual))).collect()
+    labels.filter_map(|label| Some((label.time_s, state.see(index, label)?.1.residual))).collect()
 }
 
 /// Mean part of a label's variance that the adjustment has absorbed, pixels^2 per axis.
@@ -107,10 +111,11 @@ fn explained(flight: &Flight<'_>, adjusted: &AdjustedFlight, index: usize, cauti
             let chain = adjusted.state.order().chain();
             let of_chain: Vec<Derivative> =
                 terms.iter().copied().filter(|(unknown, _)| *unknown < chain).collect();
-            let held = adjusted.covariance.variance_held(&of_chain);
+            let with_others_fixed = adjusted.covariance.variance_with_others_fixed(&of_chain);
             // Total variance = chain with the others fixed + part by the others; only the first is
             // divided.
-            sum += held / caution + adjusted.covariance.variance(&terms) - held;
+            sum += with_others_fixed / caution + adjusted.covariance.variance(&terms)
+                - with_others_fixed;
             count += 1;
         }
     }
@@ -148,7 +153,7 @@ pub(super) fn jerk(adjusted: &AdjustedFlight) -> f64 {
             let terms = [0, 1, 2, 3].map(|k| (order.way(first + k, axis), THIRD_DIFFERENCE[k]));
             // E[d^2] = d_hat^2 + Var(d): without the variance the smoothed trajectory would show
             // too little jerk.
-            sum += adjusted.covariance.variance_held(&terms);
+            sum += adjusted.covariance.variance_with_others_fixed(&terms);
         }
     }
     // The third difference has the variance power x interval^5.

@@ -1,5 +1,7 @@
 //! The target's trajectory: a uniform cubic B-spline in time, kept smooth by white jerk.
 
+use std::ops::Range;
+
 use nalgebra::{Point3, Vector3};
 
 use super::model::Knots;
@@ -9,7 +11,7 @@ use super::model::Knots;
 pub(super) const KNOT_S: f64 = 0.2;
 
 /// Clocks and a log's bias drift between knots of their own, one for this many of the trajectory's:
-/// one a second. Between two of them a consumer's receiver drifts by 0.1 m and a phone's clock by
+/// one per second. Between two of them a consumer's receiver drifts by 0.1 m and a phone's clock by
 /// 2 ms, less than what is measured in a second; with a knot each 25 s a log of metres was believed
 /// too much between two knots.
 pub(super) const IN_A_STEP: usize = 5;
@@ -115,8 +117,8 @@ impl TrajectorySpline {
     }
 
     /// Its range of time, s.
-    pub(super) fn range(&self) -> (f64, f64) {
-        (self.start_s, self.start_s + KNOT_S * self.intervals() as f64)
+    pub(super) fn range(&self) -> Range<f64> {
+        self.start_s..self.start_s + KNOT_S * self.intervals() as f64
     }
 
     /// Number of intervals.
@@ -146,7 +148,7 @@ mod tests {
             assert!((spline.velocity(&weights).x - 3.0 * t * t).abs() < 1e-9, "{t}");
         }
         assert!((spline.third_difference(5).x - 6.0 * KNOT_S.powi(3)).abs() < 1e-9);
-        let (_, end) = spline.range();
+        let end = spline.range().end;
         assert!((14.0..15.0).contains(&end));
         assert!(spline.weights(9.99).is_none() && spline.weights(end + 0.01).is_none());
         assert!(spline.weights(f64::NAN).is_none());

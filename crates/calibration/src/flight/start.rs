@@ -1,5 +1,7 @@
 //! Start with a log: a camera's pose and clock from nothing but its labels and the target's log.
 
+use std::ops::Range;
+
 use crossfix_geometry::tangent_basis;
 use nalgebra::{DMatrix, DVector, Matrix3, Point3, Rotation3, SMatrix, Unit, Vector2, Vector3};
 
@@ -32,6 +34,15 @@ const CLEANED: usize = 60;
 /// fit the linear solution as well.
 const FOLLOWED: usize = 12;
 
+/// The pose and the clock that a camera's state begins with.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct StartPose {
+    pub(super) rotation: Rotation3<f64>,
+    pub(super) centre: Point3<f64>,
+    /// How much the camera's clock is behind the common time, s.
+    pub(super) offset_s: f64,
+}
+
 /// A possible pose, and how much the camera's clock is behind the common time.
 #[derive(Clone, Debug)]
 struct CandidateStart {
@@ -44,14 +55,14 @@ struct CandidateStart {
 
 /// A direction in the camera's frame at its own time.
 #[derive(Clone, Copy, Debug)]
-struct Ray {
+struct TimedDirection {
     time_s: f64,
     /// Read-out after the frame's time, as a share of the read-out time.
     row_share: f64,
     direction: Vector3<f64>,
 }
 
-impl Ray {
+impl TimedDirection {
     fn of(camera: &CameraLabels, label: &Label) -> Option<Self> {
         let direction = lens::direction(&camera.intrinsics, label.pixel)?;
         let height = f64::from(camera.intrinsics.size.height);
@@ -83,7 +94,8 @@ pub(super) fn find(
     };
     let both = by_all.into_iter().chain(by_pieces);
     let best = both.min_by(|a, b| a.misfit.total_cmp(&b.misfit))?;
-    let state = state(camera, course, (best.rotation, best.centre, best.offset_s));
+    let CandidateStart { rotation, centre, offset_s, .. } = best;
+    let state = state(camera, course, StartPose { rotation, centre, offset_s });
     let misfit = misfit_of(camera, &state, course);
     Some((state, misfit))
 }
@@ -114,24 +126,34 @@ pub(super) fn among_others(
     frame_s: f64,
 ) -> Option<CameraLabels> {
     let (pieces, _) = pieces::of_one_thing(camera, frame_s);
-    let ones = pieces.iter().take(THINGS).filter_map(|piece| {
-        let own = rays(camera, piece);
-        let mut found = best_of(&own, &own, course, frame_s)?;
-        let mut labels = piece.clone();
-        for near_rad in [NEAR_RAD, NEARER_RAD, NEARER_RAD] {
-            let near = |piece: &&Vec<Label>| found.lies_near(camera, piece, course, near_rad);
-            labels = pieces.iter().filter(near).flatten().copied().collect();
-            found = refined(found, &rays(camera, &labels), course, frame_s)?;
-        }
-        // Where even the joined pieces do not fit, the first piece was of another thing.
-        (found.misfit < NEARER_RAD).then_some(labels)
-    });
+    let first = pieces.iter().take(THINGS);
+    let ones = first.filter_map(|piece| joined_to(piece, &pieces, camera, course, frame_s));
     let own = of_labels(camera, ones.max_by_key(Vec::len)?);
     let is_own = |label: &Label| at_once(&own.labels, label.time_s, 0.5 * frame_s);
     let left_out = camera.labels.len() - own.labels.len();
     // Labels of other things in frames that show the target too.
     let at_once = camera.labels.iter().filter(|label| is_own(label)).count() - own.labels.len();
     (at_once as f64 > AT_ONCE * left_out as f64).then_some(own)
+}
+
+/// The labels of all pieces that are of the target if this one is; `None` if it is not.
+fn joined_to(
+    piece: &[Label],
+    pieces: &[Vec<Label>],
+    camera: &CameraLabels,
+    course: &Course,
+    frame_s: f64,
+) -> Option<Vec<Label>> {
+    let own = rays(camera, piece);
+    let mut found = best_of(&own, &own, course, frame_s)?;
+    let mut labels = piece.to_vec();
+    for near_rad in [NEAR_RAD, NEARER_RAD, NEARER_RAD] {
+        let near = |piece: &&Vec<Label>| found.lies_near(camera, piece, course, near_rad);
+        labels = pieces.iter().filter(near).flatten().copied().collect();
+        found = refined(found, &rays(camera, &labels), course, frame_s)?;
+    }
+    // Where even the joined pieces do not fit, the piece was of another thing.
+    (found.misfit < NEARER_RAD).then_some(labels)
 }
 
 /// Whether a time has a label within `within_s`, of labels in order of time.
@@ -164,7 +186,12 @@ pub(super) fn of_labels(camera: &CameraLabels, mut labels: Vec<Label>) -> Camera
 }
 
 /// The best pose over all offsets: begun with linear solutions of some rays, refined with all.
-fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<CandidateStart> {
+fn best_of(
+    some: &[TimedDirection],
+    all: &[TimedDirection],
+    course: &Course,
+    frame_s: f64,
+) -> Option<CandidateStart> {
     let mut found: Vec<CandidateStart> =
         offsets(some, course)?.flat_map(|offset_s| candidates(some, course, offset_s)).collect();
     found.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
@@ -179,19 +206,19 @@ fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<C
 }
 
 /// All clock offsets at which some of the rays fall into the course, s.
-fn offsets(rays: &[Ray], course: &Course) -> Option<impl Iterator<Item = f64> + use<>> {
+fn offsets(rays: &[TimedDirection], course: &Course) -> Option<impl Iterator<Item = f64> + use<>> {
     let (first, last) = (rays.first()?.time_s, rays.last()?.time_s);
-    let (from, to) = course.range();
+    let Range { start: from, end: to } = course.range();
     // From the last ray at the course's beginning to the first one at its end.
     let count = ((to - from + last - first) / STEP_S) as usize;
     Some((0..=count).map(move |k| from - last + k as f64 * STEP_S))
 }
 
-/// A camera's state with this pose and with its clock behind by an offset (s).
+/// A camera's state that begins with this pose and offset.
 pub(super) fn state(
     camera: &CameraLabels,
     course: &Course,
-    (rotation, centre, offset_s): (Rotation3<f64>, Point3<f64>, f64),
+    StartPose { rotation, centre, offset_s }: StartPose,
 ) -> CameraUnknowns {
     let times = camera.labels.iter().map(|label| label.time_s);
     let (start, end) = times.fold((f64::INFINITY, f64::NEG_INFINITY), |(start, end), time_s| {
@@ -210,20 +237,20 @@ pub(super) fn state(
 
 /// The median angle between a camera's labels and a course, rad.
 pub(super) fn misfit_of(camera: &CameraLabels, state: &CameraUnknowns, course: &Course) -> f64 {
-    let at = |ray: &Ray| ray.met_at(state.clock.common_s(ray.time_s), course);
+    let at = |ray: &TimedDirection| ray.met_at(state.clock.common_s(ray.time_s), course);
     let rays = rays(camera, &camera.labels);
     let pairs: Vec<DirectionToPlace> = rays.iter().filter_map(at).collect();
     linear::median(angles(&pairs, &state.rotation, state.centre))
 }
 
 /// Rays of a camera's labels, at most [`TRIED`], evenly spread.
-fn rays(camera: &CameraLabels, labels: &[Label]) -> Vec<Ray> {
+fn rays(camera: &CameraLabels, labels: &[Label]) -> Vec<TimedDirection> {
     let stride = labels.len().div_ceil(TRIED).max(1);
-    labels.iter().step_by(stride).filter_map(|label| Ray::of(camera, label)).collect()
+    labels.iter().step_by(stride).filter_map(|label| TimedDirection::of(camera, label)).collect()
 }
 
 /// The linear solutions at a clock offset.
-fn candidates(rays: &[Ray], course: &Course, offset_s: f64) -> Vec<CandidateStart> {
+fn candidates(rays: &[TimedDirection], course: &Course, offset_s: f64) -> Vec<CandidateStart> {
     let Some(pairs) = seen_at(rays, course, offset_s) else { return Vec::new() };
     let maps = [linear::in_space(&pairs), linear::in_plane(&pairs)].into_iter().flatten();
     maps.filter_map(|map| CandidateStart::of(&map, &pairs, offset_s)).collect()
@@ -243,14 +270,18 @@ pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(AffineMa
 }
 
 /// The linear solution at a clock offset with outliers given less weight.
-fn cleaned(rays: &[Ray], course: &Course, offset_s: f64) -> Option<CandidateStart> {
+fn cleaned(rays: &[TimedDirection], course: &Course, offset_s: f64) -> Option<CandidateStart> {
     let pairs = seen_at(rays, course, offset_s)?;
     CandidateStart::of(&linear::robust(&pairs)?, &pairs, offset_s)
 }
 
 /// Directions with the target's places at a clock offset, if there are enough.
-fn seen_at(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Vec<DirectionToPlace>> {
-    let at = |ray: &Ray| ray.met_at(ray.time_s + offset_s, course);
+fn seen_at(
+    rays: &[TimedDirection],
+    course: &Course,
+    offset_s: f64,
+) -> Option<Vec<DirectionToPlace>> {
+    let at = |ray: &TimedDirection| ray.met_at(ray.time_s + offset_s, course);
     let pairs: Vec<DirectionToPlace> = rays.iter().filter_map(at).collect();
     // Otherwise an offset that leaves a few rays within the log would always fit best.
     let enough = LEAST_TRIED.max((LEAST_SHARE * rays.len() as f64) as usize);
@@ -272,7 +303,7 @@ impl CandidateStart {
         course: &Course,
         near_rad: f64,
     ) -> bool {
-        let at = |ray: &Ray| ray.met_at(ray.time_s + self.offset_s, course);
+        let at = |ray: &TimedDirection| ray.met_at(ray.time_s + self.offset_s, course);
         let seen: Vec<DirectionToPlace> = rays(camera, piece).iter().filter_map(at).collect();
         seen.is_empty() || linear::median(angles(&seen, &self.rotation, self.centre)) < near_rad
     }
@@ -317,7 +348,7 @@ fn angles(
 /// outliers; `None` if too few rays fall into the course.
 fn refined(
     start: CandidateStart,
-    rays: &[Ray],
+    rays: &[TimedDirection],
     course: &Course,
     frame_s: f64,
 ) -> Option<CandidateStart> {

@@ -4,8 +4,8 @@ use crossfix_geometry::Intrinsics;
 use nalgebra::{Vector2, Vector3};
 
 use super::model::{CameraLabels, CameraUnknowns, FlightLog, Knots, Label, LabelResidual};
-use super::spline::{SPAN, TrajectorySpline};
-use super::unknowns::Order;
+use super::spline::{TrajectorySpline, Weights};
+use super::unknowns::UnknownOrder;
 use crate::label_noise::LabelNoise;
 use crate::lens::LensFreedom;
 use crate::survey::Survey;
@@ -59,8 +59,8 @@ pub(super) struct FlightState {
 
 impl FlightState {
     /// The order in which the unknowns stand.
-    pub(super) fn order(&self) -> Order {
-        Order::of(&self.way, self.cameras.len(), self.bias.len())
+    pub(super) fn order(&self) -> UnknownOrder {
+        UnknownOrder::of(&self.way, self.cameras.len(), self.bias.len())
     }
 
     /// Index of each camera's first own unknown; the last entry is the end of the last camera's.
@@ -101,18 +101,13 @@ impl FlightState {
         next
     }
 
-    /// A label's residual with its derivatives, the spline's weights at its time and the first
-    /// coefficient they belong to; `None` where the trajectory does not reach that time or the
-    /// target lies behind the camera.
-    pub(super) fn see(
-        &self,
-        camera: usize,
-        label: &Label,
-    ) -> Option<(usize, [f64; SPAN], LabelResidual)> {
+    /// A label's residual with its derivatives, and the spline's weights at its time; `None` where
+    /// the trajectory does not reach that time or the target lies behind the camera.
+    pub(super) fn see(&self, camera: usize, label: &Label) -> Option<(Weights, LabelResidual)> {
         let camera = &self.cameras[camera];
         let weights = self.way.weights(camera.time_s(label))?;
         let seen = camera.see(label, self.way.place(&weights), self.way.velocity(&weights))?;
-        Some((weights.first, weights.place, seen))
+        Some((weights, seen))
     }
 }
 

@@ -51,11 +51,10 @@ impl FlightState {
             let scale = distance.sd_m.recip();
             // d|b - a| / db = (b - a) / |b - a|, and the opposite by a.
             let along = apart.normalize() * scale;
-            let ends = [(starts[a], -1.0), (starts[b], 1.0)];
-            let of_end = |(start, sign): (usize, f64)| {
-                [0, 1, 2].map(|axis| (start + 3 + axis, sign * along[axis]))
-            };
-            let terms = ends.into_iter().flat_map(of_end).collect();
+            let mut terms = Vec::new();
+            for (start, sign) in [(starts[a], -1.0), (starts[b], 1.0)] {
+                terms.extend([0, 1, 2].map(|axis| (start + 3 + axis, sign * along[axis])));
+            }
             sink.take(&[(terms, (apart.norm() - distance.metres) * scale)], Tails::Heavy);
         }
     }
@@ -66,7 +65,7 @@ impl FlightState {
         let named = |camera: &&CameraLabels| flight.survey.place(&camera.name).is_some();
         let places = flight.cameras.iter().filter(named).count();
         let names: Vec<_> = flight.cameras.iter().map(|camera| &camera.name).collect();
-        if places + flight.survey.telling_landmarks(&names) >= ENOUGH_PLACES {
+        if places + flight.survey.placing_landmarks(&names) >= ENOUGH_PLACES {
             return;
         }
         for (camera, start) in self.cameras.iter().zip(self.starts()) {

@@ -5,8 +5,6 @@
 //! the other's, with one relative pose and one offset of their clocks. Short pieces of other things
 //! meet by chance; the relative pose that joins most pieces is the true one.
 
-use nalgebra::{Point3, Rotation3};
-
 use super::course::Course;
 use super::error::LEAST_LABELS;
 use super::model::frame_time;
@@ -119,7 +117,7 @@ pub(super) fn of_one_target(cameras: &[&CameraLabels], survey: &Survey) -> Vec<C
         return as_they_are();
     }
     let mut seeds = seeds(&things, survey);
-    seeds.sort_by(|a, b| a.pair.doubt.total_cmp(&b.pair.doubt));
+    seeds.sort_by(|a, b| a.pair.range_uncertainty.total_cmp(&b.pair.range_uncertainty));
     seeds.truncate(SEEDS);
     let joined = seeds.into_iter().filter_map(|seed| seed.joined(&things, survey));
     let Some(best) = joined.max_by_key(|joined| joined.labels) else { return as_they_are() };
@@ -163,8 +161,7 @@ fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> V
     match cameras.map(|camera| survey.known(&camera.name)) {
         [Some(a), Some(b)] => {
             let poses = [a, b].map(|known| known.camera.pose());
-            let stand = poses.map(|pose| (pose.rotation(), pose.position()));
-            pairs::known(sights[0], sights[1], stand).into_iter().collect()
+            pairs::known(sights[0], sights[1], poses).into_iter().collect()
         }
         _ => pairs::find(sights[0], sights[1]),
     }
@@ -185,7 +182,7 @@ impl Joined {
             let sights = self.seen(things);
             let cameras = self.cameras.map(|camera| things[camera].camera);
             let ways = ways(cameras, sights.each_ref(), survey).into_iter();
-            self.pair = ways.min_by(|a, b| a.doubt.total_cmp(&b.doubt))?;
+            self.pair = ways.min_by(|a, b| a.range_uncertainty.total_cmp(&b.range_uncertainty))?;
             let before = std::mem::replace(&mut self.labels, counts.into_iter().sum());
             if self.labels == before {
                 break;
@@ -254,10 +251,7 @@ impl Joined {
     fn labels_of_all(&self, things: &[Things<'_>]) -> Vec<CameraLabels> {
         let own = self.own(things);
         let sights = self.seen(things);
-        let poses = [
-            (Rotation3::identity(), Point3::origin(), 0.0),
-            (self.pair.first_from_second, self.pair.centre, self.pair.ahead_s),
-        ];
+        let poses = self.pair.start_poses();
         let states = [0, 1].map(|side| start::state(&own[side], &Course::nowhere(), poses[side]));
         let placed = [0, 1].map(|side| (&sights[side], &states[side]));
         let course = Course::of(&triangulation::log(&placed));

@@ -13,14 +13,14 @@ const STEPS_IN_A_ROW: usize = 3;
 
 /// The order of the unknowns for a number of cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Order {
+pub(super) struct UnknownOrder {
     pub(super) cameras: usize,
     /// Axes of the log's bias: three, or none without a log.
     axes: usize,
     pub(super) steps: usize,
 }
 
-impl Order {
+impl UnknownOrder {
     /// Order for a flight with this trajectory and this number of axes of a log's bias.
     pub(super) fn of(way: &TrajectorySpline, cameras: usize, axes: usize) -> Self {
         Self { cameras, axes, steps: way.coefficients.len() / IN_A_STEP }

@@ -2,8 +2,9 @@
 
 use super::model::FlightLog;
 use super::noise::Tails;
+use super::normal::Derivative;
 use super::rows::Sink;
-use super::spline::{KNOT_S, SPAN, THIRD_DIFFERENCE};
+use super::spline::{KNOT_S, SPAN, THIRD_DIFFERENCE, Weights};
 use super::state::{FlightState, Priors};
 
 /// Deviation of a coefficient's movement in one step of the adjustment where nothing else
@@ -40,23 +41,34 @@ impl FlightState {
     }
 
     pub(super) fn log_rows(&self, log: &FlightLog, sink: &mut impl Sink) {
-        let order = self.order();
         let scale = log.errors.sd_m.recip();
         for sample in &log.samples {
             let Some(weights) = self.way.weights(sample.time_s) else { continue };
             let place = self.way.place(&weights);
+            // Residual of a sample: (trajectory + bias - stated place) / sd.
+            let stated = |axis: usize| place[axis] + self.bias[axis].at(sample.time_s);
             let rows = [0, 1, 2].map(|axis| {
-                let of_bias = self.bias[axis].weights(sample.time_s);
-                let chain = (0..SPAN)
-                    .map(|k| (order.way(weights.first + k, axis), weights.place[k] * scale));
-                let bias = of_bias.map(|(k, weight)| (order.bias(k, axis), weight * scale));
-                // Residual of a sample: (trajectory + bias - stated place) / sd.
-                let stated = place[axis] + self.bias[axis].at(sample.time_s);
-                (chain.chain(bias).collect(), (stated - sample.position[axis]) * scale)
+                let terms = self.log_terms(&weights, sample.time_s, axis, scale);
+                (terms, (stated(axis) - sample.position[axis]) * scale)
             });
             sink.take(&rows, Tails::Heavy);
         }
         self.bias_rows(log, sink);
+    }
+
+    /// Derivatives of one axis of trajectory and bias together at a time, times a scale.
+    fn log_terms(
+        &self,
+        weights: &Weights,
+        time_s: f64,
+        axis: usize,
+        scale: f64,
+    ) -> Vec<Derivative> {
+        let order = self.order();
+        let of_way = weights.place.iter().enumerate();
+        let chain = of_way.map(|(k, weight)| (order.way(weights.first + k, axis), weight * scale));
+        let of_bias = self.bias[axis].weights(time_s).into_iter();
+        chain.chain(of_bias.map(|(k, weight)| (order.bias(k, axis), weight * scale))).collect()
     }
 
     /// First-order Gauss-Markov bias: `b' = f b + noise`, with the same deviation at all times.

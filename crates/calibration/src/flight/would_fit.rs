@@ -27,7 +27,7 @@ const LITTLE_WORSE: f64 = 1.5;
 const LEAST_STRETCH: f64 = 0.05;
 /// Tolerance of two axes' equality, and of right angles, as a share. With half of it noise hides
 /// what is stretched, and nothing is named.
-const ALIKE: f64 = 0.05;
+const EQUAL: f64 = 0.05;
 
 /// A correction that would make a camera fit.
 #[derive(Clone, Debug, PartialEq)]
@@ -74,19 +74,19 @@ impl fmt::Display for WouldFit {
             ),
             Self::Stretched { axis: Axis::Up, times } => write!(
                 f,
-                "it fits if heights in the log are {times:.2} times what they should be against east \
-                 and north: feet for metres, or places of a map whose metre is another"
+                "it fits if heights in the log are {times:.2} times what they should be against \
+                 east and north: feet for metres, or places of a map whose metre is another"
             ),
             Self::Stretched { axis, times } => write!(
                 f,
-                "it fits if {} in the log is {times:.2} times what it should be: degrees of longitude \
-                 are shorter than those of latitude",
+                "it fits if {} in the log is {times:.2} times what it should be: degrees of \
+                 longitude are shorter than those of latitude",
                 if *axis == Axis::East { "east" } else { "north" }
             ),
             Self::Focal { times } => write!(
                 f,
-                "it fits with {times:.2} times the focal length of its lens file: a file for another \
-                 resolution, or a zoom"
+                "it fits with {times:.2} times the focal length of its lens file: a file for \
+                 another resolution, or a zoom"
             ),
             Self::LensOf { camera } => {
                 write!(f, "it fits with the lens of camera `{camera}`: are their names exchanged?")
@@ -120,10 +120,8 @@ pub(super) fn find(
     // Another camera's lens may be close to the zoomed focal length.
     let zoomed =
         map.as_ref().and_then(zoomed).map(|times| (times, with_focal(camera, course, times)));
-    let as_good = |of_lens: f64| {
-        better(of_lens) && zoomed.is_none_or(|(_, of_zoom)| of_lens < LITTLE_WORSE * of_zoom)
-    };
-    match lent.filter(|(of_lens, _)| as_good(*of_lens)) {
+    let of_zoom = zoomed.map_or(f64::INFINITY, |(_, misfit)| misfit);
+    match lent.filter(|(misfit, _)| better(*misfit) && *misfit < LITTLE_WORSE * of_zoom) {
         Some((_, camera)) => Some(WouldFit::LensOf { camera }),
         None => zoomed.map(|(times, _)| WouldFit::Focal { times }),
     }
@@ -174,17 +172,16 @@ fn zoomed(map: &AffineMap) -> Option<f64> {
     // M = s diag(f, f, 1) R gives M M' = s^2 diag(f^2, f^2, 1).
     let times = ((x * y).sqrt() / ahead).sqrt();
     // Both image axes must be stretched alike: otherwise it is no focal length.
-    let is_round = (x / y).ln().abs() < 2.0 * ALIKE;
+    let is_round = (x / y).ln().abs() < 2.0 * EQUAL;
     (is_round && (times - 1.0).abs() > LEAST_STRETCH).then_some(times)
 }
 
 /// The diagonal of a matrix that is nearly diagonal.
 fn square(matrix: &Matrix3<f64>) -> Option<[f64; 3]> {
     let diagonal = matrix.diagonal();
-    let is_small = |(i, j): (usize, usize)| {
-        matrix[(i, j)].abs() < 2.0 * ALIKE * (diagonal[i] * diagonal[j]).sqrt()
-    };
-    [(0, 1), (0, 2), (1, 2)].into_iter().all(is_small).then_some(diagonal.into())
+    let most = |[i, j]: [usize; 2]| 2.0 * EQUAL * (diagonal[i] * diagonal[j]).sqrt();
+    let mut others = [[0, 1], [0, 2], [1, 2]].into_iter();
+    others.all(|at| matrix[(at[0], at[1])].abs() < most(at)).then_some(diagonal.into())
 }
 
 /// The one of three that differs from the other two, which must be equal; its index comes first.
@@ -193,5 +190,5 @@ fn odd_one(lengths: [f64; 3]) -> Option<[usize; 3]> {
     let apart = |[_, one, other]: [usize; 3]| (lengths[one] / lengths[other]).ln().abs();
     let orders = [[0, 1, 2], [1, 0, 2], [2, 0, 1]];
     let best = orders.into_iter().min_by(|a, b| apart(*a).total_cmp(&apart(*b)))?;
-    (apart(best) < 2.0 * ALIKE).then_some(best)
+    (apart(best) < 2.0 * EQUAL).then_some(best)
 }

@@ -15,7 +15,7 @@ const SETTLED: f64 = 1e-9;
 /// Two poses fit alike if the clicks tell them apart by less than this difference of squares: three
 /// deviations. With half of it a wrong pose is returned without a word where clicks err by 2.1
 /// deviations, as in one picture of thirty.
-const ALIKE: f64 = 9.0;
+const INDISTINGUISHABLE: f64 = 9.0;
 /// Poses are the same if they are within this many deviations, squared. With half of it two starts
 /// that stop a little short of one pose may count as two, and the picture is refused.
 const SAME: f64 = 25.0;
@@ -36,7 +36,7 @@ impl AdjustedCamera {
     /// Whether another pose fits as well, and is a different one.
     pub(super) fn is_rivalled_by(&self, other: &Self) -> bool {
         // Costs are squares of deviations: a difference of 9 is three deviations.
-        if other.cost > self.cost + ALIKE {
+        if other.cost > self.cost + INDISTINGUISHABLE {
             return false;
         }
         let turned = turn_vector(&(self.state.rotation.inverse() * other.state.rotation)).norm();
@@ -58,9 +58,9 @@ impl AdjustedCamera {
         // Regression of the pose on the lens: C(pose, lens) C(lens)^-1.
         let pose_by_lens = lens.clone().cholesky()?.solve(&tied.transpose()).transpose();
         // C(pose | lens) = C(pose) - B C(lens, pose).
-        let held = all.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
-        let held = (&held + held.transpose()) * 0.5;
-        let pose = Matrix6::from_column_slice(held.as_slice());
+        let without_lens = all.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
+        let without_lens = (&without_lens + without_lens.transpose()) * 0.5;
+        let pose = Matrix6::from_column_slice(without_lens.as_slice());
         Some((pose, LensUncertainty { covariance: lens, pose_by_lens }))
     }
 }

@@ -79,8 +79,8 @@ pub enum LandmarkError {
     },
     /// Poses that are far apart fit as well as each other.
     #[error(
-        "camera `{camera}`: its landmarks are seen alike from {} and from {}: add one, or say where the \
-         camera stands (--positions)",
+        "camera `{camera}`: its landmarks are seen alike from {} and from {}: add one, or say \
+         where the camera stands (--positions)",
         place(.places[0]),
         place(.places[1])
     )]

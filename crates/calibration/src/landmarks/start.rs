@@ -69,10 +69,9 @@ fn places(picture: &LandmarkPicture, angle: f64) -> Vec<Point3<f64>> {
     let squares: f64 = known.iter().map(|place| (place - middle).norm_squared()).sum();
     let spread = (squares / count).sqrt();
     // Range = spread / angle: from there a thing of this spread is seen under this angle.
-    let place = |distance: f64| {
-        (0..DIRECTIONS).map(move |k| middle + spiral(k).into_inner() * (distance * spread / angle))
-    };
-    DISTANCES.into_iter().flat_map(place).collect()
+    let ranges = DISTANCES.into_iter().map(|distance| distance * spread / angle);
+    let about = |range: f64| (0..DIRECTIONS).map(move |k| middle + spiral(k).into_inner() * range);
+    ranges.flat_map(about).collect()
 }
 
 /// Directions evenly spread over the sphere, along a golden-angle spiral.

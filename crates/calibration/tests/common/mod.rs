@@ -62,8 +62,8 @@ pub fn labels(truth: &Truth, random: &mut ChaCha8Rng) -> CameraLabels {
     labels_of(truth, way, random)
 }
 
-/// What it labels of a way: errors of 0.1 pixels that are new in every frame, and of 0.4 that last for
-/// half a second.
+/// What it labels of a way: errors of 0.1 pixels that are new in every frame, and of 0.4 that last
+/// for half a second.
 pub fn labels_of(
     truth: &Truth,
     way: impl Fn(f64) -> Point3<f64>,

@@ -6,18 +6,20 @@ use crossfix_vision::TrackerConfig;
 use nalgebra::Vector3;
 
 use crate::calibrated;
+use crate::commands::examples;
 use crate::config::{self, CameraFile, FileKind, SiteFolder, load_network};
 use crate::output;
 use crate::parts;
 
 /// Check configuration files before anything starts, and print what they resolve to.
 ///
-/// Videos are opened and held against the intrinsics; of a folder, all files must fit together,
+/// Videos are opened and compared with the intrinsics; of a folder, all files must fit together,
 /// and certificates that are there must be believed.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-        crossfix check -c configs/site\n  \
-        crossfix check -c configs/site/north.toml")]
+#[command(after_help = examples(&[
+    "crossfix check -c configs/site",
+    "crossfix check -c configs/site/north.toml",
+]))]
 pub struct Args {
     /// A site's folder, or one of its files (TOML): a camera's, the fusion centre's, the network's.
     #[arg(short, long, value_name = "PATH")]
@@ -115,8 +117,8 @@ fn check_camera(args: &Args) -> anyhow::Result<String> {
     Ok(toml::to_string(&file)?)
 }
 
-/// Where a camera stands and looks, in words that let a person see whether the pose is the intended
-/// one.
+/// Where a camera stands and its direction of view, in words that let a person see whether the pose
+/// is the intended one.
 fn view_of(camera: &Camera) -> String {
     let place = camera.pose().position();
     let axis = camera.pose().rotation() * Vector3::z();
@@ -125,8 +127,8 @@ fn view_of(camera: &Camera) -> String {
     let lens = camera.model().intrinsics();
     let width = 2.0 * (f64::from(lens.size.width) / (2.0 * lens.fx)).atan().to_degrees();
     format!(
-        "stands at ({:.1}, {:.1}, {:.1}) m, looks to azimuth {azimuth:.0} degrees (north 0, east 90), \
-         {elevation:.0} degrees above the horizon, and sees about {width:.0} degrees across",
+        "stands at ({:.1}, {:.1}, {:.1}) m, looks to azimuth {azimuth:.0} degrees (north 0, east \
+         90), {elevation:.0} degrees above the horizon, and sees about {width:.0} degrees across",
         place.x, place.y, place.z
     )
 }

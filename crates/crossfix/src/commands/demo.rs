@@ -14,6 +14,7 @@ use crossfix_vision::{DetectorConfig, TrackerConfig};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::commands::evaluate::{Question, evaluate, render};
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::commands::view::{EarthArgs, save_recording};
 use crate::config::{
@@ -27,7 +28,7 @@ use processes::{CameraProcesses, CentreProcesses, stop_all};
 
 /// The scene that the demo plays, as in `configs/demo`.
 const SCENE: &str = include_str!("../../../../configs/demo/scene.toml");
-/// The narrow camera, which is told where to look.
+/// The narrow camera, which is turned towards the targets.
 const NARROW: &str = include_str!("../../../../configs/demo/narrow.toml");
 /// Pose SDs (rotation, mrad; position, m) of a camera on a mount, at rest, as found by a flight of
 /// ten minutes. With the accuracy of a careful survey alone it would be no better than the wide
@@ -45,15 +46,16 @@ const SETTLING_S: f64 = 1.5;
 
 /// See it work: a simulated site, real processes, Zenoh, fusion, a recording, and the error.
 ///
-/// Renders what three cameras see of two UAVs, runs an agent a camera, the fusion centre and the
-/// recorder as processes joined by Zenoh on this machine, and holds the tracks against the truth.
+/// Renders what three cameras see of two UAVs, runs one agent per camera, the fusion centre and the
+/// recorder as processes joined by Zenoh on this machine, and compares the tracks with the truth.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix demo --duration 20 --output demo-output\n  \
-    crossfix demo --live\n  \
-    crossfix demo --hand-off")]
+#[command(after_help = examples(&[
+    "crossfix demo --duration 20 --output demo-output",
+    "crossfix demo --live",
+    "crossfix demo --hand-off",
+]))]
 pub struct Args {
-    /// Seed of sky and noise.
+    /// Seed of the random sky and noise: the same seed gives the same scene.
     #[arg(long, default_value_t = 1, value_name = "N")]
     seed: u64,
     /// How long the scene lasts, seconds.
@@ -67,15 +69,15 @@ pub struct Args {
     /// The folder to write recording, picture, configurations and logs to.
     #[arg(short, long, default_value = "demo-output", value_name = "DIR")]
     output: PathBuf,
-    /// Let the cameras be network cameras: agents that know nothing of the scene watch their
-    /// streams (RTSP, H.264), are told the cameras' clocks by them, and find the targets.
+    /// Simulate network cameras: the agents get nothing but their streams (RTSP, H.264), take the
+    /// times of the images from them, and find the targets by themselves.
     #[arg(long)]
     live: bool,
-    /// Let a fourth camera, with a narrow view on a mount that turns, look for the targets where
-    /// the fusion centre tells it to.
+    /// Add a fourth camera, with a narrow view, on a mount that the fusion centre turns towards the
+    /// targets.
     #[arg(long, conflicts_with = "live")]
     hand_off: bool,
-    /// Open the live viewer (Rerun), where one is installed.
+    /// Open the live viewer (Rerun), if it is installed.
     #[arg(long)]
     view: bool,
     /// Print the result as JSON.
@@ -243,11 +245,11 @@ fn newest(
 /// A network on ports of this machine that are free at present.
 fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
     // All ports are kept open until all are known, so that none is assigned twice.
-    let mut held = Vec::new();
-    let fusion = free_endpoint(&mut held)?;
+    let mut listeners = Vec::new();
+    let fusion = free_endpoint(&mut listeners)?;
     let mut cameras = BTreeMap::new();
     for camera in world.cameras() {
-        cameras.insert(camera.name().clone(), free_endpoint(&mut held)?);
+        cameras.insert(camera.name().clone(), free_endpoint(&mut listeners)?);
     }
     Ok(NetworkConfig {
         site: "demo".parse()?,
@@ -262,11 +264,11 @@ fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
     })
 }
 
-/// An endpoint on a free port, which is kept open among those held.
-fn free_endpoint(held: &mut Vec<TcpListener>) -> anyhow::Result<String> {
+/// An endpoint on a free port, which is kept open by a listener that is added.
+fn free_endpoint(listeners: &mut Vec<TcpListener>) -> anyhow::Result<String> {
     let listener = open_free_port()?;
     let port = listener.local_addr()?.port();
-    held.push(listener);
+    listeners.push(listener);
     Ok(format!("tcp/127.0.0.1:{port}"))
 }
 

@@ -14,14 +14,17 @@ use crossfix_transport::{
 use time::OffsetDateTime;
 use toml_edit::{DocumentMut, Item, Table, value};
 
+use crate::commands::examples;
 use crate::config::load_network;
 use crate::output;
 
-/// Folders of certificates and authority, and the name of its key, unless the network file says
-/// otherwise.
+/// Folder of the certificates, beside the network file, unless that names another.
 const CERTIFICATES: &str = "certificates";
+/// Folder of the certificate authority, beside the network file.
 const AUTHORITY: &str = "authority";
+/// File of the authority's private key, in its folder.
 const AUTHORITY_KEY: &str = "authority.key";
+/// A day, the unit in which the life of certificates is given.
 const DAY: Duration = Duration::from_secs(24 * 3600);
 
 /// Make or renew a site's certificates, and secure its network by them.
@@ -29,10 +32,11 @@ const DAY: Duration = Duration::from_secs(24 * 3600);
 /// The first time it makes the site's certificate authority and adds `[security]` to the network
 /// file: from then on every link is encrypted, and each component may say only what is its own.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix enroll -c my-site/network.toml\n  \
-    crossfix enroll -c my-site/network.toml --only camera-north\n  \
-    crossfix enroll -c my-site/network.toml --revoke camera-north")]
+#[command(after_help = examples(&[
+    "crossfix enroll -c my-site/network.toml",
+    "crossfix enroll -c my-site/network.toml --only camera-north",
+    "crossfix enroll -c my-site/network.toml --revoke camera-north",
+]))]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
@@ -97,8 +101,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     output::line(output::table(&rows));
     output::line(format!(
-        "\nTo each host: {}, {} and the two files of what runs there, the key readable by it alone. \
-         {} stays here.",
+        "\nTo each host: {}, {} and the two files of what runs there, the key readable by it \
+         alone. {} stays here.",
         args.config.display(),
         security.authority_file().display(),
         authority_folder.display()
@@ -185,8 +189,8 @@ fn authority(
         let authority = Authority::load(&read(&public)?, &read(&key)?)?;
         if let Some(other) = authority.site().filter(|other| *other != site.as_str()) {
             tracing::warn!(
-                "the authority was made for site `{other}`: whoever has a certificate of that site is \
-                 believed here, too. An authority of its own: remove {} and {}",
+                "the authority was made for site `{other}`: whoever has a certificate of that \
+                 site is believed here, too. An authority of its own: remove {} and {}",
                 public.display(),
                 folder.display()
             );

@@ -2,23 +2,25 @@ use std::path::{Path, PathBuf};
 
 use crossfix_recording::RecordingWriter;
 
+use crate::commands::examples;
 use crate::import::drone_tracking::{RtkSample, SplitPart};
 use crate::import::{drone_tracking, scenario};
 use crate::output::{self, Draft};
 
 /// Turn published data sets into recordings.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
-    --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
-    crossfix import scenario DIR -o scenario.mcap")]
+#[command(after_help = examples(&[
+    "crossfix import drone-tracking-datasets DIR --dataset 3 \\\n\
+     --cameras gopro3,sony5100,sonyG -o eth.mcap",
+    "crossfix import scenario DIR -o scenario.mcap",
+]))]
 pub struct Args {
     #[command(subcommand)]
-    source: Source,
+    source: ImportSource,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Source {
+enum ImportSource {
     /// The drone-tracking-datasets of ETH Zurich: labels of several cameras, RTK truth.
     ///
     /// Data times are RTK seconds from the Unix epoch, or with --raw the seconds that each camera
@@ -26,11 +28,12 @@ enum Source {
     #[command(
         override_usage = "crossfix import drone-tracking-datasets [OPTIONS] \\\n           \
             --dataset <N> --cameras <NAMES> --output <FILE> <DIR>",
-        after_help = "Examples:\n  \
-        crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
-        --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
-        crossfix import drone-tracking-datasets DIR --dataset 3 \\\n      \
-        --cameras gopro3,sony5100,sonyG --part calibration --raw --log-out rtk.csv -o cal.mcap"
+        after_help = examples(&[
+            "crossfix import drone-tracking-datasets DIR --dataset 3 \\\n\
+             --cameras gopro3,sony5100,sonyG -o eth.mcap",
+            "crossfix import drone-tracking-datasets DIR --dataset 3 --part calibration --raw \\\n\
+             --cameras gopro3,sony5100,sonyG --log-out rtk.csv -o cal.mcap",
+        ])
     )]
     DroneTrackingDatasets {
         /// The folder with calibration/, poses.json and datasetN/.
@@ -59,7 +62,7 @@ enum Source {
         output: PathBuf,
     },
     /// A scenario folder of the format passive-bearings/1: bearings of many cameras, with truth.
-    #[command(after_help = "Example:\n  crossfix import scenario DIR -o scenario.mcap")]
+    #[command(after_help = examples(&["crossfix import scenario DIR -o scenario.mcap"]))]
     Scenario {
         /// The folder with scenario.json, exposures.csv, detections.csv and truth.csv.
         dir: PathBuf,
@@ -71,7 +74,7 @@ enum Source {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let (mut entries, path) = match &args.source {
-        Source::DroneTrackingDatasets {
+        ImportSource::DroneTrackingDatasets {
             dir,
             dataset,
             cameras,
@@ -82,14 +85,15 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             output,
         } => {
             let (dataset, part, is_raw) = (*dataset, *part, *raw);
-            let selection = drone_tracking::Selection { dataset, cameras, split, part, is_raw };
+            let selection =
+                drone_tracking::LabelSelection { dataset, cameras, split, part, is_raw };
             let flight = drone_tracking::read(dir, &selection)?;
             if let Some(path) = log_out {
                 write_log(path, &flight.log)?;
             }
             (flight.entries, output)
         }
-        Source::Scenario { dir, output } => (scenario::read(dir)?, output),
+        ImportSource::Scenario { dir, output } => (scenario::read(dir)?, output),
     };
     entries.sort_by_key(|entry| entry.data_time);
     let draft = Draft::new(path, &[])?;

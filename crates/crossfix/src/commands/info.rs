@@ -3,11 +3,14 @@ use std::path::PathBuf;
 use anyhow::ensure;
 use crossfix_recording::{RecordingInfo, Source};
 
+use crate::commands::examples;
 use crate::output;
 
 /// Say what a recording holds: channels, messages, times; and what it lacks: losses, damage.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix info recordings/two-uavs.mcap --json")]
+#[command(after_help = examples(&[
+    "crossfix info recordings/two-uavs.mcap --json",
+]))]
 pub struct Args {
     /// The recording (MCAP).
     recording: PathBuf,

@@ -3,6 +3,8 @@
 use clap::Subcommand;
 
 pub mod agent;
+#[cfg(any(feature = "centre", feature = "viewer"))]
+pub mod anchor;
 pub mod check;
 pub mod doctor;
 pub mod info;
@@ -43,6 +45,14 @@ pub mod validate;
 #[cfg(feature = "viewer")]
 pub mod view;
 
+/// The end of a command's help: how it is called. An example that goes on in another line must be
+/// broken as a shell needs it, after a backslash.
+fn examples(lines: &[&str]) -> String {
+    let title = if lines.len() == 1 { "Example:" } else { "Examples:" };
+    let lines = lines.iter().map(|line| format!("\n  {}", line.replace('\n', "\n      ")));
+    title.to_owned() + &lines.collect::<String>()
+}
+
 /// All commands: a camera host's, and what the build's features add.
 #[derive(Debug, Subcommand)]
 pub enum Command {
@@ -65,7 +75,7 @@ pub enum Command {
     Centre(CentreCommand),
 }
 
-/// What the fusion centre does, and whoever judges or plans a site.
+/// What the fusion centre does, and what evaluates or plans a site.
 #[cfg(feature = "centre")]
 #[derive(Debug, Subcommand)]
 pub enum CentreCommand {

@@ -3,19 +3,22 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use crossfix_outlet::foxglove::{FoxgloveView, Pictures};
+use crossfix_outlet::foxglove::{FoxgloveView, PictureExport};
 use crossfix_recording::{
     Entry, ReadReport, RecordingInfo, RecordingReader, RecordingWriter, Source,
 };
 
 use super::record::foxglove;
+use crate::commands::examples;
 use crate::output::{self, Draft};
 use crate::recorded::Lacks;
 
 /// Make a whole recording of a torn or damaged one: all of Crossfix's that can be read of it, with
 /// an index. What was written is read back before it gets its name.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix recover torn.mcap -o whole.mcap")]
+#[command(after_help = examples(&[
+    "crossfix recover torn.mcap -o whole.mcap",
+]))]
 pub struct Args {
     /// The recording (MCAP) that is torn or damaged.
     recording: PathBuf,
@@ -73,8 +76,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         lacks.damage.map_or("it was whole".to_owned(), |damage| format!("damaged {damage}"));
     if read.foreign > 0 {
         lost = format!(
-            "{lost}; {} messages in other schemas were left out, and Foxglove's made anew (with places \
-             on Earth by `export --foxglove --anchor`)",
+            "{lost}; {} messages in other schemas were left out, and Foxglove's made anew (with \
+             places on Earth by `export --foxglove --anchor`)",
             read.foreign
         );
     }
@@ -104,7 +107,7 @@ fn rewrite(from: &Path, to: &Path) -> anyhow::Result<(Tally, ReadReport)> {
             return Ok(());
         }
         let site = &entry.key.site;
-        let view = view.get_or_insert_with(|| FoxgloveView::new(site, None, Pictures::Said));
+        let view = view.get_or_insert_with(|| FoxgloveView::new(site, None, PictureExport::Said));
         foxglove::write(&mut writer, view, &entry)
     })?;
     writer.finish()?;

@@ -4,6 +4,7 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use crossfix_transport::{NetworkConfig, Role};
 
+use crate::commands::examples;
 use crate::config;
 use crate::health::WatchedCertificate;
 use crate::network;
@@ -18,8 +19,9 @@ const POLL: Duration = Duration::from_millis(200);
 ///
 /// It carries everybody's messages; with `[security]` it holds each component to what it may say.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  \
-        crossfix router -c configs/site/network.toml --listen tcp/127.0.0.1:7447")]
+#[command(after_help = examples(&[
+    "crossfix router -c configs/site/network.toml --listen tcp/127.0.0.1:7447",
+]))]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]

@@ -17,6 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::commands::agent::truth_frame;
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::config;
 use crate::import::{imported, labelled};
@@ -31,7 +32,12 @@ const STOPPED: &str = "asked to stop: what was not complete is removed";
 /// write a scenario.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix simulate configs/demo/scene.toml -o recordings/two-uavs.mcap\n  crossfix simulate configs/demo/scene.toml --video videos\n  crossfix simulate configs/demo/scene.toml --rtsp 127.0.0.1:8554\n  crossfix simulate --scenario crowd --targets 50 --cameras 8 --clutter 5"
+    after_help = examples(&[
+        "crossfix simulate configs/demo/scene.toml -o recordings/two-uavs.mcap",
+        "crossfix simulate configs/demo/scene.toml --video videos",
+        "crossfix simulate configs/demo/scene.toml --rtsp 127.0.0.1:8554",
+        "crossfix simulate --scenario crowd --targets 50 --cameras 8 --clutter 5",
+    ])
 )]
 pub struct Args {
     /// The scene (TOML).
@@ -39,12 +45,18 @@ pub struct Args {
     scene: Option<PathBuf>,
     /// The recording (MCAP) to write: bearings as cameras would measure them, calibrations, truth.
     /// With --rtsp, at the times at which they are played.
-    #[arg(short, long, value_name = "FILE", required_unless_present_any = ["video", "scenario", "rtsp"])]
+    #[arg(
+        short,
+        long,
+        value_name = "FILE",
+        required_unless_present_any = ["video", "scenario", "rtsp"]
+    )]
     output: Option<PathBuf>,
     /// The folder to write a rendered video (Y4M) of each camera to.
     #[arg(long, value_name = "DIR")]
     video: Option<PathBuf>,
-    /// Play the scene's cameras as live streams at this address, rtsp://ADDRESS/CAMERA, until its end.
+    /// Play the scene's cameras as live streams at this address, rtsp://ADDRESS/CAMERA, until its
+    /// end.
     #[arg(long, value_name = "ADDRESS")]
     rtsp: Option<SocketAddr>,
     /// When the streams' scene begins, seconds since the Unix epoch. Default: a second from now.

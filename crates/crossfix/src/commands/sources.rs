@@ -9,6 +9,7 @@ use crossfix_video::{
 };
 use serde::Serialize;
 
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::config::{self, CameraFile, SourceConfig};
 use crate::eye::jpeg;
@@ -32,12 +33,13 @@ const MOST_TROUBLES: usize = 10;
 
 /// Try a camera: what it sends, how often, and what its clock is worth.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix sources rtsp://10.0.0.5/stream1\n  \
-    crossfix sources -c configs/site/north.toml --picture north.jpg\n  \
-    crossfix sources\n  \
-    crossfix sources /dev/video0 --size 1280x720\n  \
-    crossfix sources http://10.0.0.5/onvif/device_service --user eye --password-file password")]
+#[command(after_help = examples(&[
+    "crossfix sources rtsp://10.0.0.5/stream1",
+    "crossfix sources -c configs/site/north.toml --picture north.jpg",
+    "crossfix sources",
+    "crossfix sources /dev/video0 --size 1280x720",
+    "crossfix sources http://10.0.0.5/onvif/device_service --user eye --password-file password",
+]))]
 pub struct Args {
     /// The stream, rtsp://HOST/PATH. One that wants to know who asks is better tried with -c: a
     /// command line can be read by others.
@@ -234,7 +236,7 @@ fn describe(service: &str, args: &Args) -> anyhow::Result<()> {
         return output::json(&camera);
     }
     output::line(&camera.name);
-    for onvif::Stream { profile, url } in &camera.streams {
+    for onvif::OfferedStream { profile, url } in &camera.streams {
         output::line(format!("  stream    {url}  {profile}"));
     }
     if let Some([pan, tilt]) = camera.position {
@@ -340,7 +342,8 @@ fn print(tried: &Tried) {
         return;
     }
     output::line(format!(
-        "  images    {}x{}, {:.2} a second, the first after {:.1} s, never more than {:.0} ms apart",
+        "  images    {}x{}, {:.2} a second, the first after {:.1} s, never more than {:.0} ms \
+         apart",
         tried.width,
         tried.height,
         tried.rate_hz,

@@ -36,7 +36,7 @@ pub struct CameraFile {
     /// cameras). May be absent with a recording, which has its own; if both this and `pose` are
     /// there, they replace the recorded calibration.
     pub intrinsics: Option<PathBuf>,
-    /// Where the camera stands and looks.
+    /// Where the camera stands, and its direction of view.
     pub pose: Option<PoseConfig>,
     /// The mount that turns the camera, if it has one: the camera then looks for what the fusion
     /// centre tells it to look for.
@@ -63,7 +63,7 @@ pub struct CameraFile {
 }
 
 /// Clock SD of an industrial camera, s: it stamps the exposure itself, and its clock is read over a
-/// quick network. With half of it a clock that is read to a millisecond claims to be twice as good
+/// quick network. With half of it a clock that is read to a millisecond would seem twice as good
 /// as it is.
 const GIGE_CLOCK_SD_S: f64 = 1e-3;
 /// Clock SD of a camera of this host, s: from the driver's times and from an exposure time that
@@ -258,7 +258,8 @@ impl CameraFile {
             let [x, y, width, height] = *place;
             ensure!(
                 PixelBox { x, y, width, height }.is_possible(),
-                "key `boxes`: {place:?} is no box: left and top within 1e6 pixels, sides of 1 to 1000"
+                "key `boxes`: {place:?} is no box: left and top within 1e6 pixels, sides of 1 to \
+                 1000"
             );
         }
         self.source.check_pace()
@@ -277,8 +278,12 @@ impl CameraFile {
             (right / 2.0, 0.0),
             (0.0, bottom / 2.0),
         ] {
-            camera.model().bearing(Pixel::new(x, y), PixelCovariance::isotropic(1.0)).with_context(|| {
-                format!("the lens shows no direction at pixel ({x}, {y}): are the distortion coefficients in their order?")
+            let bearing = camera.model().bearing(Pixel::new(x, y), PixelCovariance::isotropic(1.0));
+            bearing.with_context(|| {
+                format!(
+                    "the lens shows no direction at pixel ({x}, {y}): are the distortion \
+                     coefficients in their order?"
+                )
             })?;
         }
         self.check_boxes(camera)
@@ -290,7 +295,8 @@ impl CameraFile {
         for &[x, y, w, h] in &self.boxes {
             ensure!(
                 x + w > 0.0 && y + h > 0.0 && x < f64::from(width) && y < f64::from(height),
-                "key `boxes`: [{x}, {y}, {w}, {h}] lies outside of the image of {width}x{height} pixels"
+                "key `boxes`: [{x}, {y}, {w}, {h}] lies outside of the image of {width}x{height} \
+                 pixels"
             );
         }
         Ok(())
@@ -310,7 +316,8 @@ impl CameraFile {
         let ImageSize { width, height } = camera.model().intrinsics().size;
         ensure!(
             (frame.width, frame.height) == (width as usize, height as usize),
-            "{} has frames of {}x{} pixels, the intrinsics are for {width}x{height}: calibrate at the size of the video",
+            "{} has frames of {}x{} pixels, the intrinsics are for {width}x{height}: calibrate at \
+             the size of the video",
             path.display(),
             frame.width,
             frame.height
@@ -436,7 +443,7 @@ fn recorded_calibration(recording: &Path, name: &CameraName) -> anyhow::Result<C
     found.with_context(|| format!("the calibration of camera `{name}` in {}", recording.display()))
 }
 
-/// Reads a lens file. Of a file of several cameras (Kalibr's) the one named after `#` is taken.
+/// Reads a lens file. Of a file of several cameras (Kalibr's) the one named after `#` is read.
 fn read_lens(path: &Path) -> anyhow::Result<Intrinsics> {
     let named = path.to_str().filter(|_| !path.exists()).and_then(|path| path.rsplit_once('#'));
     let file = named.map_or(path, |(file, _)| Path::new(file));

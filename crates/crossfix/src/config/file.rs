@@ -4,7 +4,7 @@ use std::path::Path;
 use anyhow::{Context, anyhow, bail};
 use serde::de::DeserializeOwned;
 
-/// Names more similar than this (Jaro-Winkler similarity, 0 to 1) are taken for a typing error.
+/// Names more similar than this (Jaro-Winkler similarity, 0 to 1) count as a typing error.
 /// With half of it a known name would be proposed for nearly every unknown one.
 const SIMILAR: f64 = 0.6;
 
@@ -19,14 +19,15 @@ pub fn load<T: DeserializeOwned>(
 ) -> anyhow::Result<T> {
     let text = std::fs::read_to_string(path)
         .with_context(|| format!("cannot read the configuration file {}", path.display()))?;
-    parse(&text, sets).or_else(|error| {
+    parse(&text, sets).map_err(|error| {
         let kind = toml::from_str(&text).ok().and_then(|keys| FileKind::of(&keys));
         match kind.filter(|kind| *kind != wanted) {
             Some(kind) => {
-                bail!("{} is {kind}, and what is wanted here is {wanted}", path.display())
+                anyhow!("{} is {kind}, and what is wanted here is {wanted}", path.display())
             }
-            None => Err(error)
-                .with_context(|| format!("the configuration file {} has an error", path.display())),
+            None => {
+                error.context(format!("the configuration file {} has an error", path.display()))
+            }
         }
     })
 }
@@ -43,7 +44,7 @@ pub enum FileKind {
 }
 
 impl FileKind {
-    /// Kind of a file by its keys; `None` if they do not tell.
+    /// Kind of a file by its keys; `None` if they do not show it.
     pub fn of(keys: &toml::Table) -> Option<Self> {
         let has = |names: &[&str]| names.iter().any(|name| keys.contains_key(*name));
         if has(&["form"]) {
@@ -93,7 +94,7 @@ pub fn parse<T: DeserializeOwned>(text: &str, sets: &[String]) -> anyhow::Result
 fn apply(table: &mut toml::Table, set: &str) -> anyhow::Result<()> {
     let (key, value) =
         set.split_once('=').ok_or_else(|| anyhow!("`--set {set}` is not of the form key=value"))?;
-    // A value that is not valid TOML is taken as text, so that nobody has to quote twice.
+    // A value that is not valid TOML is read as text, so that nobody has to quote twice.
     let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
         .ok()
         .and_then(|mut parsed| parsed.remove("value"))

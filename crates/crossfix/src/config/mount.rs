@@ -1,4 +1,4 @@
-//! Mounts: cameras that turn to where they are told to look.
+//! Mounts: cameras that turn towards what they are to see.
 
 use std::path::PathBuf;
 
@@ -82,8 +82,8 @@ impl OnvifConfig {
             let within = |angle: f64| (-bound..=bound).contains(&angle);
             ensure!(
                 within(least) && within(most) && (most - least).abs() >= 1.0,
-                "key `mount.onvif.{key}` is [{least}, {most}]: it must be two different angles from \
-                 -{bound} to {bound}"
+                "key `mount.onvif.{key}` is [{least}, {most}]: it must be two different angles \
+                 from -{bound} to {bound}"
             );
         }
         ensure!(
@@ -123,8 +123,8 @@ impl MountConfig {
                 let (from, to) = (of[0].min(of[1]), of[0].max(of[1]));
                 ensure!(
                     from <= least && most <= to,
-                    "key `mount.{key}` is [{least}, {most}], and the mount says places from {from} to \
-                     {to} only (`mount.onvif`)"
+                    "key `mount.{key}` is [{least}, {most}], and the mount says places from \
+                     {from} to {to} only (`mount.onvif`)"
                 );
             }
         }
@@ -135,7 +135,7 @@ impl MountConfig {
 }
 
 impl CameraFile {
-    /// Whether the camera looks for what the fusion centre tells it to look for.
+    /// Whether the camera searches for the targets that the fusion centre announces to it (cues).
     pub fn looks_for_cues(&self) -> bool {
         self.takes_cues || self.mount.is_some()
     }

@@ -54,7 +54,8 @@ impl PoseConfig {
             given.iter().zip(most).all(|(sd, most)| sd.is_none_or(|sd| (0.0..=most).contains(&sd)));
         ensure!(
             possible && given[0].is_some() == given[1].is_some(),
-            "give both `rotation_sd_mrad`, from 0 to {}, and `position_sd_m`, from 0 to {}, or neither",
+            "give both `rotation_sd_mrad`, from 0 to {}, and `position_sd_m`, from 0 to {}, or \
+             neither",
             most[0],
             most[1]
         );
@@ -71,7 +72,8 @@ impl PoseConfig {
             (None, Some(rows)) => {
                 // nalgebra's From takes columns, so the rows are transposed.
                 Pose::new(Matrix3::from(rows).transpose(), position).context(
-                    "key `rotation` (rows of world_from_camera; its columns are the camera's x right, y down, z forward)",
+                    "key `rotation` (rows of world_from_camera; its columns are the camera's x \
+                     right, y down, z forward)",
                 )
             }
             _ => bail!("give either `look_at_m` or `rotation`, and not both"),

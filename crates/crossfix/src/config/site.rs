@@ -27,10 +27,11 @@ pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
 
 /// Where on the Earth a network's site is, if its file says so.
 pub fn anchor_of(network: &NetworkConfig) -> anyhow::Result<Option<Geodetic>> {
-    let place = |anchor: Anchor| {
-        Geodetic::from_degrees(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m)
-    };
-    network.anchor.map(place).transpose().context("section [anchor]")
+    network.anchor.map(geodetic).transpose().context("section [anchor]")
+}
+
+fn geodetic(anchor: Anchor) -> Result<Geodetic, crossfix_geometry::GeometryError> {
+    Geodetic::from_degrees(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m)
 }
 
 /// The TOML files of a folder with their keys, in order of name.
@@ -67,7 +68,7 @@ pub fn load_cameras(folder: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>>
     Ok(cameras)
 }
 
-/// A folder with the files of a site: what `check` looks at as a whole.
+/// A folder with the files of a site: what `check` checks as a whole.
 pub struct SiteFolder {
     pub cameras: BTreeMap<CameraName, CheckedCamera>,
     pub fusion: Vec<PathBuf>,
@@ -170,7 +171,8 @@ impl SiteFolder {
         let first = places.next();
         ensure!(
             self.cameras.len() < 2 || places.any(|place| Some(place) != first),
-            "all cameras stand at the same place: their sight lines cross nowhere else; see `position_m`"
+            "all cameras stand at the same place: their sight lines cross nowhere else; see \
+             `position_m`"
         );
         Ok(())
     }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{GstreamerConfig, StreamConfig};
 
-/// The last second of this century: a later start is taken for an error. With half of it starts
+/// The last second of this century: a later start counts as an error. With half of it starts
 /// after 2034 would be refused.
 const LAST_START_S: f64 = 4_102_444_800.0;
 
@@ -112,7 +112,8 @@ impl SourceConfig {
         );
         ensure!(
             (0.0..=LAST_START_S).contains(&start_s),
-            "key `source.start_s` is {start_s}: it must be from 0 to {LAST_START_S} s since the Unix epoch"
+            "key `source.start_s` is {start_s}: it must be from 0 to {LAST_START_S} s since the \
+             Unix epoch"
         );
         ensure!(
             (0.0..=1000.0).contains(&speed),

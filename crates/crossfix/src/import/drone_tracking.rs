@@ -30,7 +30,7 @@ const RTK_RATE: f64 = 5.0;
 const FITTED_POSITION_SD_M: f64 = 0.05;
 
 /// What to read.
-pub struct Selection<'a> {
+pub struct LabelSelection<'a> {
     pub dataset: u32,
     pub cameras: &'a [String],
     pub split: &'a str,
@@ -59,18 +59,20 @@ pub struct ImportedFlight {
 }
 
 /// Standard deviation of a raw label, pixels, as found for these cameras. It is only stated where
-/// the cameras have not been calibrated. With half of it labels claim half of their error.
+/// the cameras have not been calibrated. With half of it labels state half of their error.
 const RAW_LABEL_SD_PX: f64 = 1.0;
 
-/// Time over which the drone's angular rate is taken, s: with a frame's it would be the labels'
+/// Time over which the drone's angular rate is measured, s: with a frame's it would be the labels'
 /// noise, with a second's the drone's turns would be lost.
 const RATE_OVER_S: f64 = 0.2;
-/// Frame rates that a camera may have, frames per second, and the largest rate of its clock against
-/// true time, s/s: beyond these a file is broken. With half of either the same.
+/// Frame rates that a camera may have, frames per second: beyond these a file is broken. With half
+/// of the greatest the same.
 const FRAME_RATES: std::ops::RangeInclusive<f64> = 1.0..=1000.0;
+/// Largest rate of a camera's clock against true time, s/s: beyond it a file is broken. With half
+/// of it the same, as real clocks are off by 1e-4 at most.
 const MOST_CLOCK_RATE: f64 = 0.1;
 /// Largest standard deviation of a clock, s: one of which nothing is known. With half of it such a
-/// clock would claim to be known to half a second.
+/// clock would seem to be known to half a second.
 const MOST_CLOCK_SD_S: f64 = 1.0;
 
 #[derive(Debug, Deserialize)]
@@ -190,7 +192,7 @@ fn parse_json<T: serde::de::DeserializeOwned>(path: &Path) -> anyhow::Result<T> 
 }
 
 /// Reads a part of a split: calibrations, bearings of every frame, truth.
-pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<ImportedFlight> {
+pub fn read(dir: &Path, selection: &LabelSelection<'_>) -> anyhow::Result<ImportedFlight> {
     let site: SiteName = format!("drone-tracking-{}", selection.dataset).parse()?;
     let poses = dir.join("poses.json");
     let mut all: BTreeMap<String, serde_json::Value> = parse_json(&poses)?;
@@ -224,7 +226,8 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<ImportedFli
             FRAME_RATES.contains(&lens.fps) && fitted.clock_rate.abs() < MOST_CLOCK_RATE;
         ensure!(
             is_possible,
-            "camera `{wanted}`: {} frames a second ({}), or a clock that gains {} s a second, are none",
+            "camera `{wanted}`: {} frames a second ({}), or a clock that gains {} s a second, are \
+             none",
             lens.fps,
             lens_path.display(),
             fitted.clock_rate
@@ -240,19 +243,19 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<ImportedFli
 fn read_labels(path: &Path) -> anyhow::Result<Vec<ImportedLabel>> {
     let text = read_text(path)?;
     let starts_with_digit = |line: &&str| line.starts_with(|c: char| c.is_ascii_digit());
-    text.lines()
-        .map(str::trim)
-        .filter(starts_with_digit)
-        .map(|line| {
-            let numbers: Vec<f64> =
-                line.split_whitespace().map_while(|word| word.parse().ok()).collect();
-            let [frame, x, y, ..] = numbers[..] else {
-                bail!("{}: `{line}` is not `frame x y`", path.display());
-            };
-            let visible = x != 0.0 || y != 0.0;
-            Ok(ImportedLabel { frame: frame as u64, pixel: visible.then(|| Pixel::new(x, y)) })
-        })
-        .collect()
+    let rows = text.lines().map(str::trim).filter(starts_with_digit);
+    rows.map(|row| {
+        label(row).with_context(|| format!("{}: `{row}` is not `frame x y`", path.display()))
+    })
+    .collect()
+}
+
+/// A row of the labels, `frame x y ...`; (0, 0) says that the drone is not visible.
+fn label(row: &str) -> Option<ImportedLabel> {
+    let numbers: Vec<f64> = row.split_whitespace().map_while(|word| word.parse().ok()).collect();
+    let [frame, x, y, ..] = numbers[..] else { return None };
+    let visible = x != 0.0 || y != 0.0;
+    Some(ImportedLabel { frame: frame as u64, pixel: visible.then(|| Pixel::new(x, y)) })
 }
 
 /// What is needed to read the labels of one camera.
@@ -339,8 +342,8 @@ impl CameraSource<'_> {
         }
         let rate = (squared_rates.iter().sum::<f64>() / squared_rates.len() as f64).sqrt();
         // A Brownian motion of density w differs from its regression over a time T by the variance
-        // 2 w T / 15 at the ends. Beyond them the line's slope is taken for right, and the wander
-        // goes on from there.
+        // 2 w T / 15 at the ends. Beyond them the line's slope is assumed to be right, and the
+        // wander goes on from there.
         let off_line_s = self.clock_wander_s() * (2.0 / 15.0 * self.fitted_over_s).sqrt();
         let clock_sd_s = (self.fitted.residual_sigma_rad / rate).hypot(off_line_s);
         // Without a rate nothing is known of the clock.

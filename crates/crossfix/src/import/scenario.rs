@@ -107,23 +107,33 @@ fn bearings(dir: &Path, site: &SiteName) -> anyhow::Result<Vec<Entry>> {
             ..Default::default()
         });
     }
-    read_csv::<ExposureRow>(&dir.join("exposures.csv"))?
-        .into_iter()
+    let exposures = read_csv::<ExposureRow>(&dir.join("exposures.csv"))?.into_iter();
+    exposures
         .map(|row| {
-            let name = name_of(row.cam)?;
-            let time = Timestamp::from_seconds(row.t);
-            let frame = BearingFrame {
-                camera: name.to_string(),
-                sequence: row.scan,
-                capture_time_ns: time.nanos(),
-                clock_source: ClockSource::Simulated.into(),
-                tracks: tracks.remove(&(row.cam, row.scan)).unwrap_or_default(),
-                ..Default::default()
-            };
-            let key = Key::new(site.clone(), Channel::Bearings(name));
-            Ok(imported(key, time, frame.encode()))
+            let detections = tracks.remove(&(row.cam, row.scan)).unwrap_or_default();
+            exposure(site, &row, detections)
         })
         .collect()
+}
+
+/// The message of one exposure.
+fn exposure(
+    site: &SiteName,
+    row: &ExposureRow,
+    detections: Vec<BearingTrack>,
+) -> anyhow::Result<Entry> {
+    let name = name_of(row.cam)?;
+    let time = Timestamp::from_seconds(row.t);
+    let frame = BearingFrame {
+        camera: name.to_string(),
+        sequence: row.scan,
+        capture_time_ns: time.nanos(),
+        clock_source: ClockSource::Simulated.into(),
+        tracks: detections,
+        ..Default::default()
+    };
+    let key = Key::new(site.clone(), Channel::Bearings(name));
+    Ok(imported(key, time, frame.encode()))
 }
 
 fn truth(dir: &Path, site: &SiteName, scenario: &Scenario) -> anyhow::Result<Vec<Entry>> {

@@ -1,6 +1,6 @@
 //! A network camera's mount, and where it reports that it points.
 //!
-//! An ONVIF mount is told a position and goes there in its own time; asked, it reports where it is
+//! An ONVIF mount gets a position and goes there in its own time; asked, it reports where it is
 //! and whether it moves, a network delay later. So its report is valid for an image only if it has
 //! stood still for as long as an image takes to arrive; until then no image has a known direction.
 
@@ -26,12 +26,12 @@ const ASKED_EVERY: Duration = Duration::from_millis(100);
 /// Longest time from an exposure through encoder, network and decoder to its image here. If a
 /// camera takes longer, images of a turn are attributed to the place where the turn ended.
 const IMAGE_COMES_WITHIN: Duration = Duration::from_millis(500);
-/// A report older than this no longer tells where the mount is. With half of it an answer that
+/// A report older than this no longer says where the mount is. With half of it an answer that
 /// takes half a second leaves images without a direction; with twice as much a mount that answers
 /// no more still gives them one for two seconds.
 const SAID_HOLDS: Duration = Duration::from_secs(1);
-/// If the mount has not moved this long after an order, it is taken to have gone as far as it can.
-/// With half of it one that takes longer to begin would be told again.
+/// If the mount has not moved this long after an order, it counts as having gone as far as it can.
+/// With half of it one that takes longer to begin would get the order again.
 const BEGINS_WITHIN: Duration = Duration::from_secs(1);
 /// A mount that has refused to turn is not asked again for this long, so that its camera can see
 /// meanwhile. With half of it the camera would be kept from seeing twice as often.
@@ -42,41 +42,47 @@ const SAME_SDS: f64 = 3.0;
 /// Zooms that differ by more than this are different: on most lenses a hundredth is also one of
 /// focal length. With twice as much images of a lens with another focal length would be used.
 const SAME_ZOOM: f32 = 0.01;
-/// First and longest pause before a failed request is repeated: some cameras lock out a client that
-/// fails too often. With twice the longest a mount that is back may be unknown for two minutes.
+/// First pause before a failed request is repeated; each further one is longer, as some cameras
+/// lock out a client that fails too often. With half of it one more request fails.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
+/// Longest pause before a failed request is repeated. With twice as much a mount that is back may
+/// be unknown for two minutes.
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
 /// Angles of a mount as a function of the positions that it reports, each from -1 to 1.
 #[derive(Clone, Copy, Debug)]
-struct Scale {
+struct AngleScale {
     /// Azimuth at a pan of -1 and 1, rad.
     pan: [f64; 2],
     /// Elevation at a tilt of -1 and 1, rad.
     tilt: [f64; 2],
 }
 
-impl Scale {
+impl AngleScale {
     fn angles(&self, [pan, tilt]: [f32; 2]) -> ScanAngles {
-        let at = |[least, most]: [f64; 2], place: f32| {
-            least + (most - least) * (f64::from(place) + 1.0) / 2.0
-        };
-        ScanAngles { azimuth: at(self.pan, pan), elevation: at(self.tilt, tilt) }
+        ScanAngles { azimuth: angle(self.pan, pan), elevation: angle(self.tilt, tilt) }
     }
 
     fn position(&self, angles: ScanAngles) -> [f32; 2] {
-        let of = |[least, most]: [f64; 2], angle: f64| {
-            (2.0 * (angle - least) / (most - least) - 1.0).clamp(-1.0, 1.0) as f32
-        };
-        [of(self.pan, angles.azimuth), of(self.tilt, angles.elevation)]
+        [position(self.pan, angles.azimuth), position(self.tilt, angles.elevation)]
     }
 }
 
-/// Where a mount was told to turn.
+/// The angle at a position from -1 to 1; `ends` are the angles at both.
+fn angle([least, most]: [f64; 2], position: f32) -> f64 {
+    least + (most - least) * (f64::from(position) + 1.0) / 2.0
+}
+
+/// The position, from -1 to 1, of an angle; the first are the angles at both ends.
+fn position([least, most]: [f64; 2], angle: f64) -> f32 {
+    (2.0 * (angle - least) / (most - least) - 1.0).clamp(-1.0, 1.0) as f32
+}
+
+/// An order to a mount to turn.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Order {
+struct TurnOrder {
     to: ScanAngles,
-    /// When the mount was told; `None` while it has not been.
+    /// When it was sent; `None` while it has not been.
     sent: Option<Instant>,
 }
 
@@ -89,7 +95,7 @@ struct Head {
     said: Option<(ScanAngles, Instant)>,
     /// Where it has stood still, and since when.
     still: Option<(ScanAngles, Instant)>,
-    order: Option<Order>,
+    order: Option<TurnOrder>,
     /// When it last refused to turn.
     refused: Option<Instant>,
 }
@@ -106,7 +112,7 @@ impl Head {
     }
 
     fn order(&mut self, to: ScanAngles) {
-        self.order = Some(Order { to, sent: None });
+        self.order = Some(TurnOrder { to, sent: None });
     }
 
     /// Whether it has not refused to turn recently.
@@ -119,7 +125,7 @@ impl Head {
         (self.order, self.refused) = (None, Some(now));
     }
 
-    /// Notes that the mount has been told to turn, unless a newer order has replaced this one.
+    /// Notes that the order was sent, unless a newer order has replaced this one.
     fn told(&mut self, to: ScanAngles, now: Instant) {
         if let Some(order) = self.order.as_mut().filter(|order| order.to == to) {
             order.sent = Some(now);
@@ -133,16 +139,16 @@ impl Head {
     }
 
     /// Takes in a report of where the mount is, and whether it moves.
-    fn hear(&mut self, angles: ScanAngles, moves: bool, now: Instant) {
+    fn observe(&mut self, angles: ScanAngles, moves: bool, now: Instant) {
         let stays = !moves && self.still.is_some_and(|(there, _)| self.is_at(angles, there));
         if !stays {
             self.still = (!moves).then_some((angles, now));
         }
         self.said = Some((angles, now));
-        let Some(Order { to, sent: Some(sent) }) = self.order else { return };
+        let Some(TurnOrder { to, sent: Some(sent) }) = self.order else { return };
         if !stays {
             // It may stop short of its goal: the wait begins again where it stops.
-            self.order = Some(Order { to, sent: Some(now) });
+            self.order = Some(TurnOrder { to, sent: Some(now) });
         } else if self.is_at(angles, to) || now.duration_since(sent) > BEGINS_WITHIN {
             self.order = None;
         }
@@ -168,9 +174,9 @@ impl Head {
 
 /// What an agent and the thread that asks the mount share.
 #[derive(Clone, Debug)]
-struct Shared(Arc<Mutex<Head>>);
+struct SharedHead(Arc<Mutex<Head>>);
 
-impl Shared {
+impl SharedHead {
     fn with<T>(&self, act: impl FnOnce(&mut Head) -> T) -> T {
         // A panic cannot leave the value half written.
         act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
@@ -181,7 +187,7 @@ impl Shared {
 struct Reach {
     address: Url,
     login: Option<Login>,
-    scale: Scale,
+    scale: AngleScale,
     /// Zoom of the calibrated lens: as declared, or else as the mount first reports it.
     zoom: Option<f32>,
 }
@@ -198,7 +204,7 @@ impl Reach {
 /// this: it is asked again as long as the value lives.
 #[derive(Debug)]
 pub struct OnvifMount {
-    shared: Shared,
+    shared: SharedHead,
     /// Ends the thread when dropped.
     stop: Option<oneshot::Sender<Infallible>>,
     thread: Option<JoinHandle<()>>,
@@ -214,10 +220,10 @@ impl OnvifMount {
         let reach = Reach {
             address: config.url.clone(),
             login: config.login()?,
-            scale: Scale { pan: radians(config.pan_deg), tilt: radians(config.tilt_deg) },
+            scale: AngleScale { pan: radians(config.pan_deg), tilt: radians(config.tilt_deg) },
             zoom: config.zoom.map(|zoom| zoom as f32),
         };
-        let shared = Shared(Arc::new(Mutex::new(Head::new(angle_sd_rad))));
+        let shared = SharedHead(Arc::new(Mutex::new(Head::new(angle_sd_rad))));
         let (stop, stopped) = oneshot::channel();
         let runtime = runtime()?;
         let asked = shared.clone();
@@ -256,7 +262,7 @@ impl Mount for OnvifMount {
 }
 
 /// Asks a mount for ever, with growing pauses while it does not answer.
-async fn ask_for_ever(shared: Shared, mut reach: Reach) {
+async fn ask_for_ever(shared: SharedHead, mut reach: Reach) {
     let mut repeats = Repeats::default();
     let mut pause = FIRST_PAUSE;
     loop {
@@ -272,9 +278,9 @@ async fn ask_for_ever(shared: Shared, mut reach: Reach) {
     }
 }
 
-/// Asks a mount where it points, and tells it where to turn, until it stops answering.
+/// Asks a mount where it points, and orders it where to turn, until it stops answering.
 async fn ask(
-    shared: &Shared,
+    shared: &SharedHead,
     reach: &mut Reach,
     repeats: &mut Repeats,
     has_answered: &mut bool,
@@ -296,7 +302,7 @@ async fn ask(
         } else {
             let moves = status.pan_tilt_status == "MOVING" || status.zoom_status == "MOVING";
             let angles = reach.scale.angles(position);
-            shared.with(|head| head.hear(angles, moves, now));
+            shared.with(|head| head.observe(angles, moves, now));
         }
         let order = shared.with(|head| head.order).filter(|order| order.sent.is_none());
         let is_due = zoom_set.is_none_or(|at| now.duration_since(at) > ASKED_TO_TURN_AGAIN);

@@ -17,7 +17,7 @@ use url::Url;
 pub use head::OnvifMount;
 use transport::ToCamera;
 
-/// A camera that does not answer within this time is taken to be absent. With half of it those that
+/// A camera that does not answer within this time counts as absent. With half of it those that
 /// take two seconds for an answer would be.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(3);
 /// Most characters of a camera's own text that are shown. With half as many a long fault loses its
@@ -40,14 +40,14 @@ pub struct Described {
     /// Maker and model.
     pub name: String,
     /// Its pictures.
-    pub streams: Vec<Stream>,
+    pub streams: Vec<OfferedStream>,
     /// Pan and tilt that its mount reports, each from -1 to 1, if it has one that reports them.
     pub position: Option<[f32; 2]>,
 }
 
 /// One of the streams that a camera offers.
 #[derive(Debug, PartialEq, serde::Serialize)]
-pub struct Stream {
+pub struct OfferedStream {
     /// The camera's name of the stream's profile.
     pub profile: String,
     pub url: String,
@@ -68,6 +68,7 @@ fn runtime() -> anyhow::Result<Runtime> {
 /// # Errors
 /// If the query cannot be sent.
 pub fn cameras(answered_within: Duration) -> anyhow::Result<Vec<(String, String)>> {
+    /// Beginning of the scope that holds a camera's name, by the ONVIF core specification.
     const NAME: &str = "onvif://www.onvif.org/name/";
     let found = wait(async { Ok(oxvif::discovery::probe_result(answered_within).await?) })?;
     let named = found.into_iter().filter_map(|device| {
@@ -91,7 +92,10 @@ pub fn describe(address: &Url, login: Option<&Login>) -> anyhow::Result<Describe
         for profile in answered(device.client.get_profiles(media.as_str())).await? {
             let asked = device.client.get_stream_uri(media.as_str(), &profile.token);
             let address = answered(asked).await?.uri;
-            streams.push(Stream { profile: printable(&profile.name), url: printable(&address) });
+            streams.push(OfferedStream {
+                profile: printable(&profile.name),
+                url: printable(&address),
+            });
         }
         let position = match device.profile_of_head().await {
             Ok((head, profile)) => {

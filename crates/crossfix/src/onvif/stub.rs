@@ -12,7 +12,9 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use sha1::{Digest, Sha1};
 
+/// The user that the stub accepts.
 pub const USER: &str = "eye";
+/// The password that the stub accepts.
 pub const PASSWORD: &str = "hunter2";
 /// Turning rate, in units of the position range (-1 to 1) per second.
 const RATE: f64 = 0.8;
@@ -28,24 +30,24 @@ pub enum Reply {
 
 /// Where the mount is and where it goes.
 #[derive(Clone, Debug)]
-pub struct State {
+pub struct MountMotion {
     from: [f64; 2],
     to: [f64; 2],
-    told: Instant,
+    ordered: Instant,
     pub zoom: f64,
     /// Whether it reports where it is.
     pub says: bool,
     /// Whether it refuses to turn.
     pub refuses: bool,
-    /// How often it was told to turn.
+    /// How often it was ordered to turn.
     pub moves: usize,
     pub instead: Option<Reply>,
 }
 
-impl State {
+impl MountMotion {
     /// Pan and tilt now, and whether they change.
     pub fn position(&self) -> ([f64; 2], bool) {
-        let passed = self.told.elapsed().saturating_sub(BEGINS_AFTER).as_secs_f64();
+        let passed = self.ordered.elapsed().saturating_sub(BEGINS_AFTER).as_secs_f64();
         let now = [0, 1].map(|axis| self.turned(axis, passed));
         (now, now != self.to && passed > 0.0)
     }
@@ -59,7 +61,7 @@ impl State {
 
 /// The simulated camera, which runs until it is dropped.
 pub struct Stub {
-    pub state: Arc<Mutex<State>>,
+    pub state: Arc<Mutex<MountMotion>>,
     pub port: u16,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -70,10 +72,10 @@ impl Stub {
     pub fn start(port: u16) -> Self {
         let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
         let port = listener.local_addr().unwrap().port();
-        let state = State {
+        let state = MountMotion {
             from: [0.0; 2],
             to: [0.0; 2],
-            told: Instant::now(),
+            ordered: Instant::now(),
             zoom: 0.0,
             says: true,
             refuses: false,
@@ -107,7 +109,7 @@ impl Drop for Stub {
     }
 }
 
-fn answer(stream: &TcpStream, state: &Mutex<State>) -> std::io::Result<()> {
+fn answer(stream: &TcpStream, state: &Mutex<MountMotion>) -> std::io::Result<()> {
     let mut reader = BufReader::new(stream);
     let mut length = 0;
     for line in reader.by_ref().lines() {
@@ -207,7 +209,8 @@ fn reply(request: &str, state: &Mutex<State>) -> (&'static str, String) {
         ("GetDeviceInformation", "<Manufacturer>Stub</Manufacturer><Model>One</Model>".to_owned())
     } else if asks("GetProfiles") {
         let body = "<Profiles token=\"plain\"><Name>still</Name></Profiles>\
-                    <Profiles token=\"main\"><Name>main</Name><PTZConfiguration token=\"t\"/></Profiles>";
+                    <Profiles token=\"main\"><Name>main</Name><PTZConfiguration \
+                    token=\"t\"/></Profiles>";
         ("GetProfiles", body.to_owned())
     } else if asks("GetStreamUri") {
         ("GetStreamUri", "<MediaUri><Uri>rtsp://127.0.0.1/main</Uri></MediaUri>".to_owned())
@@ -231,8 +234,8 @@ fn reply(request: &str, state: &Mutex<State>) -> (&'static str, String) {
         if state.refuses {
             return ("500 Internal Server Error", fault("Position out of bounds"));
         }
-        let (told, zoom) = (Instant::now(), of("Zoom", "x"));
-        *state = State { from, to, told, zoom, ..state.clone() };
+        let (ordered, zoom) = (Instant::now(), of("Zoom", "x"));
+        *state = MountMotion { from, to, ordered, zoom, ..state.clone() };
         ("AbsoluteMove", String::new())
     } else {
         return ("400 Bad Request", String::new());

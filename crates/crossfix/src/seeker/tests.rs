@@ -63,26 +63,26 @@ const REST: ScanAngles = ScanAngles { azimuth: 0.0, elevation: 0.0 };
 #[test]
 fn it_turns_ahead_of_the_target_and_stares_while_that_crosses_the_view() {
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
-    assert_eq!(seeker.look(seconds(0.9), Pointed::Settled(REST), &[]), Orders::default());
-    seeker.hear(cue(1.0, 0.8, 0.05, [1e-3; 2]));
-    let aim = seeker.look(seconds(1.0), Pointed::Settled(REST), &[]).aim.unwrap();
+    assert_eq!(seeker.observe(seconds(0.9), Pointed::Settled(REST), &[]), Orders::default());
+    seeker.take_cues(cue(1.0, 0.8, 0.05, [1e-3; 2]));
+    let aim = seeker.observe(seconds(1.0), Pointed::Settled(REST), &[]).aim.unwrap();
     assert!(aim.azimuth > 0.82 && aim.azimuth < 0.88, "{aim:?}");
     assert!((aim.elevation - 0.2).abs() < 1e-4);
     // On the way it gets no new order unless the target is somewhere quite different; once there it
     // stays until the target has passed.
     let half = ScanAngles { azimuth: 0.4, elevation: 0.1 };
-    assert_eq!(seeker.look(seconds(1.1), Pointed::Turning(half), &[]).aim, None);
-    seeker.hear(cue(1.1, -0.8, 0.05, [1e-3; 2]));
-    let other = seeker.look(seconds(1.1), Pointed::Turning(half), &[]).aim.unwrap();
+    assert_eq!(seeker.observe(seconds(1.1), Pointed::Turning(half), &[]).aim, None);
+    seeker.take_cues(cue(1.1, -0.8, 0.05, [1e-3; 2]));
+    let other = seeker.observe(seconds(1.1), Pointed::Turning(half), &[]).aim.unwrap();
     assert!(other.azimuth < -0.7, "{other:?}");
-    seeker.hear(cue(1.1, 0.805, 0.05, [1e-3; 2]));
-    let aim = seeker.look(seconds(1.1), Pointed::Turning(half), &[]).aim.unwrap();
+    seeker.take_cues(cue(1.1, 0.805, 0.05, [1e-3; 2]));
+    let aim = seeker.observe(seconds(1.1), Pointed::Turning(half), &[]).aim.unwrap();
     assert!((aim.azimuth - 0.854).abs() < 1e-3, "{aim:?}");
     let turned: Vec<f64> = (0..40)
         .map(|k| 1.2 + 0.1 * f64::from(k))
         .filter(|&t| {
-            seeker.hear(cue(t, 0.8 + 0.05 * (t - 1.0), 0.05, [1e-3; 2]));
-            seeker.look(seconds(t), Pointed::Settled(aim), &[]).aim.is_some()
+            seeker.take_cues(cue(t, 0.8 + 0.05 * (t - 1.0), 0.05, [1e-3; 2]));
+            seeker.observe(seconds(t), Pointed::Settled(aim), &[]).aim.is_some()
         })
         .collect();
     assert!((2.5..3.3).contains(&turned[0]), "{turned:?}");
@@ -91,10 +91,10 @@ fn it_turns_ahead_of_the_target_and_stares_while_that_crosses_the_view() {
 #[test]
 fn a_track_is_taken_over_when_it_has_been_where_the_cue_is_for_three_images() {
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
-    seeker.hear(cue(1.0, 0.5, 0.0, [1e-3; 2]));
+    seeker.take_cues(cue(1.0, 0.5, 0.0, [1e-3; 2]));
     let at = ScanAngles { azimuth: 0.48, elevation: 0.21 };
     let look = |seeker: &mut Seeker, tracks: &[BearingTrack]| {
-        let orders = seeker.look(seconds(1.1), Pointed::Settled(at), tracks);
+        let orders = seeker.observe(seconds(1.1), Pointed::Settled(at), tracks);
         orders.taken_over.map(|taken| (taken.image_track_id, taken.of.unwrap().track_id))
     };
     let (target, bird) = (track(3, at, 0.5005, 0.2), track(4, at, 0.47, 0.2));
@@ -106,7 +106,7 @@ fn a_track_is_taken_over_when_it_has_been_where_the_cue_is_for_three_images() {
     let rival = track(5, at, 0.4998, 0.2);
     assert_eq!(look(&mut seeker, &[rival, target]), Some((3, 7)));
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
-    seeker.hear(cue(1.0, 0.5, 0.0, [1e-3; 2]));
+    seeker.take_cues(cue(1.0, 0.5, 0.0, [1e-3; 2]));
     assert!((0..10).all(|_| look(&mut seeker, &[rival, target]).is_none()));
 }
 
@@ -116,8 +116,8 @@ fn a_stripe_is_looked_along_from_its_middle_to_both_ends() {
     let (mut at, mut views) = (REST, Vec::new());
     for k in 0..200 {
         let t = 0.1 * f64::from(k);
-        seeker.hear(cue(t, 0.6, 0.0, [0.3, 1e-3]));
-        if let Some(aim) = seeker.look(seconds(t), Pointed::Settled(at), &[]).aim {
+        seeker.take_cues(cue(t, 0.6, 0.0, [0.3, 1e-3]));
+        if let Some(aim) = seeker.observe(seconds(t), Pointed::Settled(at), &[]).aim {
             at = aim;
             views.push(aim.azimuth - 0.6);
         }
@@ -134,8 +134,8 @@ fn a_stripe_is_looked_along_from_its_middle_to_both_ends() {
     let looks = (0..60).map(|k| 20.0 + 0.1 * f64::from(k));
     let orders: Vec<Orders> = looks
         .map(|t| {
-            seeker.hear(cue(t, 0.6, 0.0, [0.3, 1e-1]));
-            seeker.look(seconds(t), Pointed::Settled(at), &[seen])
+            seeker.take_cues(cue(t, 0.6, 0.0, [0.3, 1e-1]));
+            seeker.observe(seconds(t), Pointed::Settled(at), &[seen])
         })
         .collect();
     assert!(orders.iter().skip(3).all(|orders| orders.aim.is_none()));
@@ -145,8 +145,8 @@ fn a_stripe_is_looked_along_from_its_middle_to_both_ends() {
 #[test]
 fn old_and_impossible_cues_move_nothing() {
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
-    seeker.hear(cue(1.0, 0.8, 0.05, [1e-3; 2]));
-    assert_eq!(seeker.look(seconds(4.0), Pointed::Settled(REST), &[]), Orders::default());
+    seeker.take_cues(cue(1.0, 0.8, 0.05, [1e-3; 2]));
+    assert_eq!(seeker.observe(seconds(4.0), Pointed::Settled(REST), &[]), Orders::default());
     let spoil: [fn(&mut Expected); 5] = [
         |one| one.bearing = None,
         |one| one.bearing = Some(Vector3::zeros().into()),
@@ -157,13 +157,13 @@ fn old_and_impossible_cues_move_nothing() {
     for spoil in spoil {
         let mut cues = cue(1.0, 0.8, 0.05, [1e-3; 2]);
         cues.cues[0].ahead.iter_mut().for_each(spoil);
-        seeker.hear(cues);
-        assert_eq!(seeker.look(seconds(1.0), Pointed::Settled(REST), &[]), Orders::default());
+        seeker.take_cues(cues);
+        assert_eq!(seeker.observe(seconds(1.0), Pointed::Settled(REST), &[]), Orders::default());
     }
     let mut empty = cue(1.0, 0.8, 0.05, [1e-3; 2]);
     empty.cues[0].ahead.clear();
-    seeker.hear(empty);
-    assert_eq!(seeker.look(seconds(1.0), Pointed::Settled(REST), &[]), Orders::default());
+    seeker.take_cues(empty);
+    assert_eq!(seeker.observe(seconds(1.0), Pointed::Settled(REST), &[]), Orders::default());
 }
 
 #[test]
@@ -174,10 +174,10 @@ fn a_camera_that_stands_still_takes_over_what_it_sees_and_turns_nothing() {
     let mut cues = cue(1.0, 1.5, 0.0, [1e-3; 2]);
     cues.cues.push(cue(1.0, 0.02, 0.0, [1e-3; 2]).cues.remove(0));
     cues.cues[1].of = Some(Cued { track_id: 8, ..Default::default() });
-    seeker.hear(cues);
+    seeker.take_cues(cues);
     let seen = track(3, REST, 0.02, 0.2);
     let orders: Vec<Orders> =
-        (0..3).map(|_| seeker.look(seconds(1.1), Pointed::Fixed, &[seen])).collect();
+        (0..3).map(|_| seeker.observe(seconds(1.1), Pointed::Fixed, &[seen])).collect();
     assert!(orders.iter().all(|orders| orders.aim.is_none()));
     let taken = orders[2].taken_over.as_ref().unwrap();
     assert_eq!((taken.image_track_id, taken.of.as_ref().unwrap().track_id), (3, 8));
@@ -197,10 +197,10 @@ fn what_is_found_is_not_left_for_one_image_without_it_nor_for_orders_that_nobody
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
     for k in 0..60 {
         let t = 1.0 + 0.05 * f64::from(k);
-        seeker.hear(stripe(t));
+        seeker.take_cues(stripe(t));
         let missed = [20, 30, 31].contains(&k);
         let tracks = if missed { &[][..] } else { std::slice::from_ref(&seen) };
-        let orders = seeker.look(seconds(t), Pointed::Settled(at), tracks);
+        let orders = seeker.observe(seconds(t), Pointed::Settled(at), tracks);
         assert_eq!(orders.aim, None, "{k}");
         assert_eq!(orders.taken_over.is_some(), k >= 2 && !missed, "{k}");
     }
@@ -212,13 +212,13 @@ fn what_is_found_is_not_left_for_one_image_without_it_nor_for_orders_that_nobody
     let looks: Vec<Orders> = (0..5)
         .map(|k| {
             let t = 1.0 + 0.05 * f64::from(k);
-            seeker.hear(cue(t, 0.3, 0.0, [1e-3; 2]));
-            seeker.look(seconds(t), Pointed::Settled(aside), &[seen])
+            seeker.take_cues(cue(t, 0.3, 0.0, [1e-3; 2]));
+            seeker.observe(seconds(t), Pointed::Settled(aside), &[seen])
         })
         .collect();
     assert!(looks.iter().all(|orders| orders.aim.is_none()) && looks[4].taken_over.is_some());
     seeker.hold(false);
-    let orders = seeker.look(seconds(1.25), Pointed::Settled(aside), &[seen]);
+    let orders = seeker.observe(seconds(1.25), Pointed::Settled(aside), &[seen]);
     assert!(orders.aim.is_some());
 }
 
@@ -227,11 +227,11 @@ fn what_is_found_is_not_left_for_one_image_without_it_nor_for_orders_that_nobody
 fn what_the_angles_are_off_by_widens_the_gate() {
     for (angle_sd_rad, taken) in [(0.0, false), (3e-3, true)] {
         let mut seeker = Seeker::new(&model(), Some(mount()), angle_sd_rad);
-        seeker.hear(cue(1.0, 0.5, 0.0, [6e-4; 2]));
+        seeker.take_cues(cue(1.0, 0.5, 0.0, [6e-4; 2]));
         let (said, truth) = (0.5, 0.504);
         let [at, really] = [said, truth].map(|azimuth| ScanAngles { azimuth, elevation: 0.2 });
         let target = track(3, really, 0.5, 0.2);
-        let looks = (0..4).map(|_| seeker.look(seconds(1.1), Pointed::Settled(at), &[target]));
+        let looks = (0..4).map(|_| seeker.observe(seconds(1.1), Pointed::Settled(at), &[target]));
         assert_eq!(looks.last().unwrap().taken_over.is_some(), taken);
     }
 }
@@ -244,13 +244,13 @@ fn stares(slow_rad_per_s: f64, settles_s: f64) -> Vec<f64> {
     let mut stood: Vec<f64> = Vec::new();
     for k in 0..600 {
         let t = 0.05 * f64::from(k);
-        seeker.hear(cue(t, 0.6, 0.0, [0.3, 1e-3]));
+        seeker.take_cues(cue(t, 0.6, 0.0, [0.3, 1e-3]));
         let pointed = if t < arrives { Pointed::Turning(at) } else { Pointed::Settled(to) };
         if t >= arrives {
             at = to;
             *stood.last_mut().unwrap_or(&mut 0.0) += 0.05;
         }
-        if let Some(aim) = seeker.look(seconds(t), pointed, &[]).aim {
+        if let Some(aim) = seeker.observe(seconds(t), pointed, &[]).aim {
             assert!(t >= arrives, "it is told nothing else on its way");
             arrives = t + (aim.azimuth - at.azimuth).abs() / slow_rad_per_s + settles_s;
             to = aim;
@@ -277,8 +277,8 @@ fn what_the_mount_does_not_reach_is_left_for_what_it_does() {
     let mut cues = cue(1.0, 3.12, 0.02, [1e-3; 2]);
     cues.cues.push(cue(1.0, 1.0, 0.02, [1e-3; 2]).cues.remove(0));
     cues.cues[1].of = Some(Cued { track_id: 8, ..Default::default() });
-    seeker.hear(cues);
-    let aim = seeker.look(seconds(1.0), Pointed::Settled(REST), &[]).aim.unwrap();
+    seeker.take_cues(cues);
+    let aim = seeker.observe(seconds(1.0), Pointed::Settled(REST), &[]).aim.unwrap();
     assert!((0.9..1.1).contains(&aim.azimuth), "{aim:?}");
     // At the end of its range the mount reports slightly different angles than it was told.
     let mut seeker = Seeker::new(&model(), Some(reach), 0.0);
@@ -286,8 +286,8 @@ fn what_the_mount_does_not_reach_is_left_for_what_it_does() {
     let mut at = REST;
     for k in 0..100 {
         let t = 1.0 + 0.05 * f64::from(k);
-        seeker.hear(cue(t, 3.05, 0.0, [1e-3; 2]));
-        if let Some(aim) = seeker.look(seconds(t), Pointed::Settled(at), &[]).aim {
+        seeker.take_cues(cue(t, 3.05, 0.0, [1e-3; 2]));
+        if let Some(aim) = seeker.observe(seconds(t), Pointed::Settled(at), &[]).aim {
             turns += 1;
             at = ScanAngles { azimuth: aim.azimuth + 1e-4, ..aim };
         }
@@ -313,19 +313,19 @@ fn a_track_is_preferred_to_what_one_camera_saw_unless_that_is_found() {
         let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
         for k in 0..4 {
             let t = 1.0 + 0.1 * f64::from(k);
-            seeker.hear(of_one(t));
-            seeker.look(seconds(t), Pointed::Settled(at), tracks);
+            seeker.take_cues(of_one(t));
+            seeker.observe(seconds(t), Pointed::Settled(at), tracks);
         }
-        seeker.hear(both(1.4));
-        let aim = seeker.look(seconds(1.4), Pointed::Settled(at), tracks).aim;
+        seeker.take_cues(both(1.4));
+        let aim = seeker.observe(seconds(1.4), Pointed::Settled(at), tracks).aim;
         assert_eq!(aim.is_some_and(|aim| aim.azimuth < 0.0), leaves, "{aim:?}");
         // The found target becomes a track, and there is another: the seeker stays on its own.
         if !leaves {
             let mut cues = cue(1.5, -0.5, 0.0, [1e-3; 2]);
             cues.cues.push(cue(1.5, 0.301, 0.0, [1e-3; 2]).cues.remove(0));
             cues.cues[1].of = Some(Cued { track_id: 9, ..Default::default() });
-            seeker.hear(cues);
-            assert_eq!(seeker.look(seconds(1.5), Pointed::Settled(at), tracks).aim, None);
+            seeker.take_cues(cues);
+            assert_eq!(seeker.observe(seconds(1.5), Pointed::Settled(at), tracks).aim, None);
         }
     }
 }
@@ -333,18 +333,19 @@ fn a_track_is_preferred_to_what_one_camera_saw_unless_that_is_found() {
 #[test]
 fn while_nobody_knows_where_it_points_nothing_is_taken_over_and_nothing_turned() {
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
-    seeker.hear(cue(1.0, 0.02, 0.0, [1e-3; 2]));
+    seeker.take_cues(cue(1.0, 0.02, 0.0, [1e-3; 2]));
     let seen = track(3, REST, 0.02, 0.2);
     assert!(
-        (0..9)
-            .all(|_| { seeker.look(seconds(1.1), Pointed::Unknown, &[seen]) == Orders::default() })
+        (0..9).all(|_| {
+            seeker.observe(seconds(1.1), Pointed::Unknown, &[seen]) == Orders::default()
+        })
     );
     // The target's name is copied into every frame, so an overlong one is refused.
     let mut long = cue(1.0, 0.02, 0.0, [1e-3; 2]);
     long.cues[0].of = Some(Cued { camera: "x".repeat(1 << 20), ..Default::default() });
-    seeker.hear(long);
-    assert_eq!(seeker.look(seconds(1.1), Pointed::Settled(REST), &[seen]), Orders::default());
+    seeker.take_cues(long);
+    assert_eq!(seeker.observe(seconds(1.1), Pointed::Settled(REST), &[seen]), Orders::default());
     // A cue from too far in the future.
-    seeker.hear(cue(9.0, 0.02, 0.0, [1e-3; 2]));
-    assert_eq!(seeker.look(seconds(1.1), Pointed::Settled(REST), &[seen]), Orders::default());
+    seeker.take_cues(cue(9.0, 0.02, 0.0, [1e-3; 2]));
+    assert_eq!(seeker.observe(seconds(1.1), Pointed::Settled(REST), &[seen]), Orders::default());
 }

@@ -27,7 +27,7 @@ pub(super) struct DrawnKind {
     clutter: fn(&mut Noise) -> Vec<SceneClutter>,
 }
 
-/// The kinds.
+/// The kinds, in the order of their tables.
 pub(super) const KINDS: [DrawnKind; 6] = [
     DrawnKind {
         name: "ablation-noise",
@@ -73,25 +73,29 @@ pub(super) const KINDS: [DrawnKind; 6] = [
     },
 ];
 
-/// Frames per second, and how long a scene lasts, s. With half of the time the target crosses what
-/// is in its way once at most.
+/// Frames per second. With half of it the target moves by twice as much from image to image.
 const RATE_HZ: f64 = 30.0;
+/// How long a scene lasts, s. With half of it the target crosses what is in its way once at most.
 const DURATION_S: f64 = 10.0;
-/// Columns and rows, and the focal length in pixels. With half of them each run takes a quarter of
-/// the time, and the target covers a tenth of the image.
+/// Columns and rows of the images. With half of them each run takes a quarter of the time, and the
+/// scenes leave the image.
 const SIZE_PX: [u32; 2] = [320, 240];
+/// Focal length, px: a field of view of 56 degrees across. With half of it the target is half as
+/// large in the image.
 const FOCAL_PX: f64 = 300.0;
-/// Distance of the target's path, m; its span, m: 9 px there. With half of the span it is lost in
-/// the noise at once.
+/// Distance of the target's path, m. With half of it the target is twice as large in the image, and
+/// before all that should hide it.
 const RANGE_M: f64 = 100.0;
+/// Span of the target, m: 9 px there. With half of it it is lost in the noise at once.
 const SPAN_M: f64 = 3.0;
-/// Height of a silhouette as a share of its span.
+/// Height of a silhouette as a share of its span, as it is drawn. With half of it the box would be
+/// twice as high as its target.
 const HEIGHT: f64 = 0.4;
 /// Period of the camera's pan, s. With half of it the scene moves by 12 px an image at most,
 /// instead of 6.
 const PAN_S: f64 = 3.0;
 /// How the target is given: a box beside it and too large, as an operator draws it. With half of
-/// both the box needs no mend.
+/// both the box needs no correction.
 const START: TrialStart = TrialStart { aside_px: 3.0, larger: 1.3, later_s: 0.0 };
 
 /// Upright masts, bright and dark, before the target and behind it.
@@ -108,18 +112,19 @@ fn masts(noise: &mut Noise) -> Vec<SceneClutter> {
 
 /// Wires behind the target, which its sight line crosses.
 fn wires(noise: &mut Noise) -> Vec<SceneClutter> {
-    [-12.0, 0.0, 12.0]
-        .map(|up| {
-            let mut end = || up + (noise.uniform() - 0.5) * 12.0;
-            SceneClutter::Wire {
-                from_m: [-80.0, 120.0, end()],
-                to_m: [80.0, 120.0, end()],
-                sag_m: 5.0,
-                width_m: 0.5,
-                level: 40.0,
-            }
-        })
-        .into()
+    [-12.0, 0.0, 12.0].map(|up| wire(up, noise)).into()
+}
+
+/// A wire whose ends are about `up` m above the camera.
+fn wire(up: f64, noise: &mut Noise) -> SceneClutter {
+    let mut end = || up + (noise.uniform() - 0.5) * 12.0;
+    SceneClutter::Wire {
+        from_m: [-80.0, 120.0, end()],
+        to_m: [80.0, 120.0, end()],
+        sag_m: 5.0,
+        width_m: 0.5,
+        level: 40.0,
+    }
 }
 
 /// Birds as large and as dark as the target, on paths of their own.

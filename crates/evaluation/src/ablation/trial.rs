@@ -12,7 +12,7 @@ const NEAR_PX: f64 = 10.0;
 /// Distance beyond which a track is on something else, px: it cannot overlap a small target. With
 /// half of it a loose label counts as something else.
 const FAR_PX: f64 = 20.0;
-/// The number of the one target that is given.
+/// The number of the one target that is given: the tracker's first.
 const GIVEN: ImageTrackId = ImageTrackId(1);
 
 /// What became of one trial.
@@ -22,7 +22,7 @@ pub(super) struct TrialScore {
     near: u32,
     /// Sum of the squared distances in those frames, px^2.
     squares: f64,
-    /// Longest time for which something else was claimed to be the target, s.
+    /// Longest time for which something else was shown as the target, s.
     pub(super) longest_wrong_s: f64,
 }
 
@@ -44,7 +44,7 @@ impl TrialScore {
 pub(super) struct Trial {
     tracker: ImageTracker,
     score: TrialScore,
-    /// Since when something else has been claimed to be the target.
+    /// Since when something else has been shown as the target.
     wrong_since: Option<Timestamp>,
 }
 
@@ -62,14 +62,13 @@ impl Trial {
     /// Follows the target into an image in which it is in a box, if that is known.
     pub(super) fn step(&mut self, image: &Plane, time: Timestamp, label: Option<PixelBox>) {
         let tracks = self.tracker.step(image, time);
-        let claimed = tracks.iter().find(|track| track.id == GIVEN && is_claimed(track));
+        let shown = tracks.iter().find(|track| track.id == GIVEN && is_shown(track));
         let Some(truth) = label.map(|label| label.centre()) else {
             // Nobody knows what is right here.
             self.wrong_since = None;
             return;
         };
-        let off =
-            claimed.map(|track| (track.position.x - truth.x).hypot(track.position.y - truth.y));
+        let off = shown.map(|track| (track.position.x - truth.x).hypot(track.position.y - truth.y));
         self.score.labelled += 1;
         if let Some(near) = off.filter(|off| *off <= NEAR_PX) {
             self.score.near += 1;
@@ -89,7 +88,7 @@ impl Trial {
     }
 }
 
-/// Whether a track claims to be on its target.
-fn is_claimed(track: &ImageTrack) -> bool {
+/// Whether a track is shown as on its target.
+fn is_shown(track: &ImageTrack) -> bool {
     track.phase != TrackPhase::Searching
 }

@@ -14,9 +14,9 @@ const RINGS: [f64; 5] = [0.5, 0.75, 1.0, 1.25, 1.5];
 /// Candidates per ring. With half of it the best direction may be missed by 15 degrees; with twice
 /// as many the advice takes twice as long.
 const DIRECTIONS: u32 = 24;
-/// Largest number of cubes that a candidate is judged by; of more cubes every n-th is taken. With
-/// half of it places that are nearly alike are ranked by which cubes were taken; with twice as many
-/// the advice takes twice as long.
+/// Largest number of cubes that a candidate is scored by; of more cubes every n-th is used. With
+/// half of it places that are nearly as good as each other are ranked by which cubes were used;
+/// with twice as many the advice takes twice as long.
 const SAMPLE: usize = 2000;
 
 /// Quality of a set of cameras over a volume.
@@ -46,7 +46,7 @@ pub struct CandidatePlace {
 pub struct Advice {
     /// Name of the camera whose intrinsics, rate and clock the additional one has.
     pub like: String,
-    /// What each candidate looks at, ENU, m.
+    /// The point that each candidate is aimed at, ENU, m.
     pub look_at_m: [f64; 3],
     /// The score of the present cameras.
     pub now: Score,
@@ -114,21 +114,21 @@ fn known_cube(
 }
 
 fn score_with(known: &[SampleCube], extra: Option<&TimedCamera>, worst_m: f64) -> Score {
-    let mut fixed = 0;
-    let mut deviations: Vec<f64> = known
-        .iter()
-        .map(|known| {
-            let (mut information, mut cameras) = (known.information, known.cameras);
-            if let Some(more) = extra.and_then(|extra| extra.information(known.point)) {
-                information += &more;
-                cameras += 1;
-            }
-            let sd = accuracy(cameras, &information).map(|accuracy| accuracy.position_sd_m);
-            fixed += usize::from(sd.is_some());
-            sd.unwrap_or(worst_m).min(worst_m)
-        })
-        .collect();
+    let known: Vec<Option<f64>> = known.iter().map(|known| deviation_with(known, extra)).collect();
+    let fixed = known.iter().flatten().count();
+    let mut deviations: Vec<f64> =
+        known.into_iter().map(|sd| sd.unwrap_or(worst_m).min(worst_m)).collect();
     score(&mut deviations, fixed)
+}
+
+/// Standard deviation of a position in a cube with an additional camera, m; `None` without a fix.
+fn deviation_with(known: &SampleCube, extra: Option<&TimedCamera>) -> Option<f64> {
+    let (mut information, mut cameras) = (known.information, known.cameras);
+    if let Some(more) = extra.and_then(|extra| extra.information(known.point)) {
+        information += &more;
+        cameras += 1;
+    }
+    accuracy(cameras, &information).map(|accuracy| accuracy.position_sd_m)
 }
 
 fn median(mut values: Vec<f64>) -> Option<f64> {

@@ -64,9 +64,9 @@ impl LineGeometry {
 
 /// Noise of one bearing, independent between bearings: the inverse of its covariance, 1/rad^2.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct BearingNoise(Matrix2<f64>);
+pub struct BearingInformation(Matrix2<f64>);
 
-impl BearingNoise {
+impl BearingInformation {
     /// Noise with a covariance, rad^2, in the tangents of its line.
     ///
     /// `None` if it is not positive definite.
@@ -110,11 +110,11 @@ impl FromIterator<f64> for TimeOffsets {
 /// bound: no unbiased estimator of `[p, v]` has a smaller covariance.
 ///
 /// ```
-/// use crossfix_evaluation::bound::{BearingNoise, FisherInformation, LineGeometry};
+/// use crossfix_evaluation::bound::{BearingInformation, FisherInformation, LineGeometry};
 /// use nalgebra::Point3;
 ///
 /// let target = Point3::new(0.0, 0.0, 50.0);
-/// let noise = BearingNoise::isotropic(1e-3).ok_or("noise")?;
+/// let noise = BearingInformation::isotropic(1e-3).ok_or("noise")?;
 /// let mut information = FisherInformation::default();
 /// for (camera, phase) in [(Point3::new(100.0, 0.0, 0.0), 0.0), (Point3::new(0.0, 100.0, 0.0), 0.1)] {
 ///     for period in 0..5 {
@@ -138,12 +138,17 @@ impl FisherInformation {
     }
 
     /// Adds a bearing at `dt_s` from the reference time.
-    pub fn add(&mut self, line: &LineGeometry, noise: &BearingNoise, dt_s: f64) {
+    pub fn add(&mut self, line: &LineGeometry, noise: &BearingInformation, dt_s: f64) {
         self.add_all(line, noise, &[dt_s].into_iter().collect());
     }
 
     /// Adds bearings that differ only in their times.
-    pub fn add_all(&mut self, line: &LineGeometry, noise: &BearingNoise, times: &TimeOffsets) {
+    pub fn add_all(
+        &mut self,
+        line: &LineGeometry,
+        noise: &BearingInformation,
+        times: &TimeOffsets,
+    ) {
         let across = line.by_displacement();
         // Sum over dt of [E'/r, E' dt/r]' R^-1 [E'/r, E' dt/r].
         let position = across.transpose() * noise.0 * across;
@@ -246,12 +251,17 @@ pub struct CameraInformation {
 
 impl CameraInformation {
     /// Adds a bearing at `dt_s` from the reference time.
-    pub fn add(&mut self, line: &LineGeometry, noise: &BearingNoise, dt_s: f64) {
+    pub fn add(&mut self, line: &LineGeometry, noise: &BearingInformation, dt_s: f64) {
         self.add_all(line, noise, &[dt_s].into_iter().collect());
     }
 
     /// Adds bearings that differ only in their times.
-    pub fn add_all(&mut self, line: &LineGeometry, noise: &BearingNoise, times: &TimeOffsets) {
+    pub fn add_all(
+        &mut self,
+        line: &LineGeometry,
+        noise: &BearingInformation,
+        times: &TimeOffsets,
+    ) {
         self.target.add_all(line, noise, times);
         let by_errors = line.by_errors();
         let weighted = noise.0 * by_errors;
@@ -301,7 +311,7 @@ mod tests {
         let mut information = FisherInformation::velocity_prior(1.0);
         for (u, sd) in towards.into_iter().zip([first_sd, second_sd]) {
             let line = LineGeometry::between(Point3::from(u * -100.0), Point3::origin()).unwrap();
-            information.add(&line, &BearingNoise::isotropic(sd / 100.0).unwrap(), 0.0);
+            information.add(&line, &BearingInformation::isotropic(sd / 100.0).unwrap(), 0.0);
         }
         let covariance = position(&information.covariance().unwrap());
         covariance.m11.sqrt()
@@ -324,7 +334,7 @@ mod tests {
     fn one_line_and_two_alike_fix_nothing() {
         let line = LineGeometry::between(Point3::new(0.0, -50.0, 0.0), Point3::origin()).unwrap();
         let behind = LineGeometry::between(Point3::new(0.0, -90.0, 0.0), Point3::origin()).unwrap();
-        let noise = BearingNoise::isotropic(1e-3).unwrap();
+        let noise = BearingInformation::isotropic(1e-3).unwrap();
         let mut information = FisherInformation::velocity_prior(15.0);
         for line in [line, behind] {
             for dt in [-0.2, -0.1, 0.0] {
@@ -340,7 +350,7 @@ mod tests {
         const RUNS: usize = 2000;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let velocity = Normal::new(0.0, 15.6).unwrap();
-        let noise = BearingNoise::isotropic(0.1 / 150.0).unwrap();
+        let noise = BearingInformation::isotropic(0.1 / 150.0).unwrap();
         let elevation = 35.264_389_68_f64.to_radians();
         let (mut position_trace, mut velocity_trace) = (0.0, 0.0);
         for _ in 0..RUNS {
@@ -390,7 +400,7 @@ mod tests {
             let line = LineGeometry::between(Point3::from(axis * 100.0), Point3::origin()).unwrap();
             let times: TimeOffsets = (0..count).map(|n| -(n as f64) / count as f64).collect();
             let mut camera = CameraInformation::default();
-            camera.add_all(&line, &BearingNoise::isotropic(1e-3).unwrap(), &times);
+            camera.add_all(&line, &BearingInformation::isotropic(1e-3).unwrap(), &times);
             information += &camera.marginal(errors);
         }
         position(&information.covariance().unwrap()).trace().sqrt()
@@ -429,7 +439,7 @@ mod tests {
             about in proptest::array::uniform3(-2.0..2.0), tied in -0.9..0.9,
         ) {
             let line = LineGeometry::between(Point3::origin(), Point3::new(x, y, z)).unwrap();
-            let noise = BearingNoise::new(&Matrix2::new(4e-6, 1e-6, 1e-6, 2e-6)).unwrap();
+            let noise = BearingInformation::new(&Matrix2::new(4e-6, 1e-6, 1e-6, 2e-6)).unwrap();
             let mut camera = CameraInformation::default();
             for dt in [-0.9, -0.4, 0.0] {
                 camera.add(&line, &noise, dt);

@@ -9,7 +9,8 @@ mod volume;
 
 pub use advice::{Advice, CandidatePlace, Score, advise};
 pub use information::{
-    BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets,
+    BearingInformation, CameraInformation, CommonErrors, FisherInformation, LineGeometry,
+    TimeOffsets,
 };
 pub use plan::{
     Accuracy, Assumptions, Cell, DEGENERATE_RATIO, PlannedCamera, TargetSize, predict,

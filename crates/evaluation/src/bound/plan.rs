@@ -5,8 +5,8 @@ use nalgebra::{Matrix6, Point3};
 use serde::Serialize;
 
 use super::{
-    BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets,
-    Volume,
+    BearingInformation, CameraInformation, CommonErrors, FisherInformation, LineGeometry,
+    TimeOffsets, Volume,
 };
 
 /// A fix is degenerate if its worst axis has a deviation more than this many times its best one's.
@@ -176,7 +176,7 @@ impl<'a> TimedCamera<'a> {
         let sight_line = self.camera.sight_line_to(point, self.noise)?;
         let line = LineGeometry::of(&sight_line, range)?;
         let mut information = CameraInformation::default();
-        information.add_all(&line, &BearingNoise::new(&sight_line.covariance)?, &self.times);
+        information.add_all(&line, &BearingInformation::new(&sight_line.covariance)?, &self.times);
         Some(information.marginal(&self.errors))
     }
 }

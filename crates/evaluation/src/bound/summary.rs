@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use nalgebra::Matrix6;
 use serde::Serialize;
 
 use super::{Accuracy, Assumptions, Cell, PlannedCamera, Volume, predict};
@@ -129,9 +130,7 @@ fn without(
 impl Contribution {
     fn of(camera: &PlannedCamera, assumptions: &Assumptions, sees: f64, without: Summary) -> Self {
         let lens = camera.camera.model().intrinsics();
-        let per_axis = |first: usize| {
-            (camera.pose_covariance.fixed_view::<3, 3>(first, first).trace() / 3.0).sqrt()
-        };
+        let per_axis = |first| sd_per_axis(&camera.pose_covariance, first);
         Self {
             name: camera.name.clone(),
             rate_hz: camera.rate_hz,
@@ -144,6 +143,11 @@ impl Contribution {
             without,
         }
     }
+}
+
+/// Root mean variance of three components of a pose, from the first.
+fn sd_per_axis(pose_covariance: &Matrix6<f64>, first: usize) -> f64 {
+    (pose_covariance.fixed_view::<3, 3>(first, first).trace() / 3.0).sqrt()
 }
 
 #[cfg(test)]

@@ -137,13 +137,15 @@ impl Volume {
         (self.max() - self.min).norm()
     }
 
+    /// The middle of a cube, by its column, row and layer.
+    fn centre(&self, cube: [usize; 3]) -> Point3<f64> {
+        self.min + Vector3::from(cube.map(|index| (index as f64 + 0.5) * self.step_m))
+    }
+
     /// The cubes' middles, layer by layer from below, with the index of the layer.
     pub fn centres(&self) -> impl Iterator<Item = (usize, Point3<f64>)> + '_ {
         let [columns, rows, layers] = self.cells;
-        let at = move |cell: [usize; 3]| {
-            self.min + Vector3::from(cell.map(|index| (index as f64 + 0.5) * self.step_m))
-        };
-        let row = move |(z, y)| (0..columns).map(move |x| (z, at([x, y, z])));
+        let row = move |(z, y)| (0..columns).map(move |x| (z, self.centre([x, y, z])));
         (0..layers).flat_map(move |z| (0..rows).map(move |y| (z, y))).flat_map(row)
     }
 }

@@ -5,11 +5,12 @@ use crossfix_vision::{ImmConfig, PixelImm};
 
 use super::ValidationOptions;
 use super::runs::{self, Noise};
-use super::table::{Limit, Table, TableRow, mean};
+use super::table::{Limit, SampleStatistic, Table, TableRow, mean};
 
-/// Number of frames of an experiment, and their interval, s. At the lowest rate of jumps, 0.1 per
-/// second, a run has four; with half of either, two, so that the errors scatter more.
+/// Number of frames of an experiment. At the lowest rate of jumps, 0.1 per second, a run has four;
+/// with half of it two, so that the errors scatter more.
 const FRAMES: usize = 1000;
+/// Interval of the frames, s. With half of it a run has half as many jumps.
 const INTERVAL: f64 = 0.04;
 /// Weight of the old value in exponential smoothing. It divides the variance of the noise by 19,
 /// half of it by 2.6, which would give another ratio than the paper's.
@@ -75,10 +76,11 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                 ..row
             });
             rows.push(TableRow::new(format!("smoothing, {name}"), rate, smoothing));
-            let ratio = smoothing.0 / filter.0;
+            let ratio = smoothing.value / filter.value;
             // The relative variances of a quotient's parts add up.
-            let relative = (filter.1 / filter.0).hypot(smoothing.1 / smoothing.0);
-            let row = TableRow::new(name, rate, (ratio, ratio * relative));
+            let relative = relative_error(filter).hypot(relative_error(smoothing));
+            let ours = SampleStatistic { value: ratio, standard_error: ratio * relative };
+            let row = TableRow::new(name, rate, ours);
             let paper = (rate == 0.1).then_some(claimed[0]).or((rate == 0.9).then_some(claimed[1]));
             let limit = asked.map(|_| Limit::AtLeast(3.0));
             ratios.push(TableRow { paper, limit, ..row });
@@ -93,6 +95,10 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         ),
         table("brightness-ratio", "Smoothing's error over the IMM's", "ratio", ratios),
     ]
+}
+
+fn relative_error(of: SampleStatistic) -> f64 {
+    of.standard_error / of.value
 }
 
 fn table(name: &'static str, title: &str, y: &'static str, rows: Vec<TableRow>) -> Table {

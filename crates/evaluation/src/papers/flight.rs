@@ -8,15 +8,17 @@ use nalgebra::{Matrix2, Vector2};
 
 use super::runs::Noise;
 
-/// Time between images in the papers ("tact"), s.
+/// Time between images in the papers ("tact"), s. They count everything in tacts, so with half of
+/// it only the units of the configuration would change.
 pub(crate) const TACT: f64 = 1.0 / 30.0;
-/// Standard deviation of the places given to a tracker, about the true ones, px. The tracker is
-/// told it, so that its covariance is true from the start; with half of it the same.
+/// Standard deviation of the places given to a tracker, about the true ones, px. It is in the
+/// tracker's configuration, so that its covariance is true from the start; with half of it the
+/// same.
 const GIVEN_SD: f64 = 0.02;
 /// Sides of the pictures, px. The straight flights end at 590 px; with half of it they would leave
 /// the picture.
 const SIDE: usize = 640;
-/// Frames of a flight (Herasymenko 2021, section 3).
+/// Frames of a flight (Herasymenko 2021, section 3). With half of it fewer targets would be lost.
 pub(crate) const FRAMES: usize = 20;
 
 /// Places of the papers' target: from (100, 100) at 10 px per tact on each axis, with white

@@ -9,8 +9,13 @@ use super::flight::{Canvas, PaperFollower, Stamp};
 use super::runs::{self, Noise};
 use super::table::{Limit, Table, TableRow, mean, root_mean_square, share};
 
+/// Sides of the silhouette, px: the errata's (docs/papers.md), whose figures are beside ours.
 const SIDES: [usize; 2] = [25, 15];
+/// Standard deviation of the noise, contrasts of the silhouette: the errata's. With half of it the
+/// strategies differ less.
 const SIGMA_N: f64 = 0.25;
+/// Frames of a flight: the errata's. With half of it one of the two occlusions is left, and the
+/// target turns by half as much.
 const FRAMES: usize = 100;
 /// The runs are divided by this: a flight of this experiment is five times as long as the papers'.
 /// With half of it the experiment takes twice as long.
@@ -28,6 +33,7 @@ struct LoopCase {
     asked: f64,
 }
 
+/// The cases of the errata, in their order, each with its own requirement.
 const SCENES: [LoopCase; 5] = [
     LoopCase { name: "no change", light: false, occlusion: false, turn: false, asked: 0.22 },
     LoopCase { name: "light steps", light: true, occlusion: false, turn: false, asked: 0.24 },
@@ -76,7 +82,7 @@ fn fly(
             errors.push(x.hypot(y));
         }
     }
-    Some((root_mean_square(&errors).0, off_at_end))
+    Some((root_mean_square(&errors).value, off_at_end))
 }
 
 /// RMSE and losses of every strategy in every scene.

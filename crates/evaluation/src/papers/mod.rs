@@ -15,7 +15,7 @@ mod table;
 
 pub(crate) use runs::{Noise, all as all_runs};
 pub(crate) use table::mean;
-pub use table::{Limit, Table, TableRow, Verdict};
+pub use table::{Limit, SampleStatistic, Table, TableRow, Verdict};
 
 /// Extent of the simulation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,6 +38,7 @@ struct Experiment {
     make: fn(ValidationOptions) -> Vec<Table>,
 }
 
+/// The image tracker's experiments, in the order of their tables.
 const TRACKER: [Experiment; 7] = [
     Experiment {
         name: "energies and signal-to-noise ratios (Lytvynets 2020, tables 1 and 2)",
@@ -52,7 +53,8 @@ const TRACKER: [Experiment; 7] = [
         make: motion::tables,
     },
     Experiment {
-        name: "loss of track (Herasymenko 2021, Fig. 7 and 8; Lytvynets 2020, tables 3 and 4), paper mode",
+        name: "loss of track (Herasymenko 2021, Fig. 7 and 8; Lytvynets 2020, tables 3 and 4), \
+               paper mode",
         make: loss::paper_tables,
     },
     Experiment { name: "loss of track, default", make: loss::default_tables },
@@ -64,7 +66,7 @@ const TRACKER: [Experiment; 7] = [
 ];
 
 /// Computes the image tracker's tables, of the experiments whose name contains `only`. `progress`
-/// is told the number of experiments done, the number of all, and the name of the next.
+/// is given the number of experiments done, the number of all, and the name of the next.
 pub fn validate_tracker(
     options: ValidationOptions,
     only: &str,

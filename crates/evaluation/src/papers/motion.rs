@@ -8,33 +8,37 @@ use nalgebra::Vector2;
 use super::ValidationOptions;
 use super::flight::{Canvas, FRAMES, PaperFollower, Stamp, TACT, TrackErrors, texts_path};
 use super::runs::{self, Noise};
-use super::table::{Limit, Table, TableRow, mean, root_mean_square};
+use super::table::{Limit, SampleStatistic, Table, TableRow, mean, root_mean_square};
 
 /// Number of runs of the filter alone for each run of the tracker: they take next to no time. With
 /// half of it standard errors are 1.4 times as large.
 const CHEAP: usize = 20;
 
 /// NEES of the filter on its own model; required within 0.1 of 2.
-fn filter_nees(options: ValidationOptions, sigma_a: f64) -> (f64, f64) {
+fn filter_nees(options: ValidationOptions, sigma_a: f64) -> SampleStatistic {
     let samples = runs::all(CHEAP * options.runs, |run| {
-        let mut noise = Noise::new(options.seed, run);
-        let (mut position, mut velocity) = (0.0, 10.0);
-        let measured: [AxisMeasurement; FRAMES] = std::array::from_fn(|_| {
-            let acceleration = sigma_a * noise.normal();
-            position += velocity + acceleration / 2.0;
-            velocity += acceleration;
-            AxisMeasurement { position: position + noise.normal(), variance: 1.0 }
-        });
-        let mut filter = AxisFilter::start(measured[0], measured[1], 1.0, sigma_a);
-        for measured in &measured[2..] {
-            filter.time_update(1.0);
-            filter.measurement_update(*measured);
-        }
-        let error = Vector2::new(position - filter.position(), velocity - filter.velocity());
-        let inverse = filter.covariance().try_inverse();
-        inverse.map_or(f64::NAN, |inverse| (error.transpose() * inverse * error).x)
+        nees_of_flight(Noise::new(options.seed, run), sigma_a)
     });
     mean(&samples)
+}
+
+/// NEES at the end of one flight with white acceleration.
+fn nees_of_flight(mut noise: Noise, sigma_a: f64) -> f64 {
+    let (mut position, mut velocity) = (0.0, 10.0);
+    let measured: [AxisMeasurement; FRAMES] = std::array::from_fn(|_| {
+        let acceleration = sigma_a * noise.normal();
+        position += velocity + acceleration / 2.0;
+        velocity += acceleration;
+        AxisMeasurement { position: position + noise.normal(), variance: 1.0 }
+    });
+    let mut filter = AxisFilter::start(measured[0], measured[1], 1.0, sigma_a);
+    for measured in &measured[2..] {
+        filter.time_update(1.0);
+        filter.measurement_update(*measured);
+    }
+    let error = Vector2::new(position - filter.position(), velocity - filter.velocity());
+    let inverse = filter.covariance().try_inverse();
+    inverse.map_or(f64::NAN, |inverse| (error.transpose() * inverse * error).x)
 }
 
 /// Motion of a target: white acceleration with an SD, px/tact^2, for a number of frames, the first
@@ -47,37 +51,50 @@ struct MotionCase {
     skipped: usize,
 }
 
-/// The papers' flight, and a straight one, counted from when a second has shown that it is
-/// straight.
+/// The papers' flight.
 const TEXTS: MotionCase = MotionCase { name: "texts", sigma_a: 1.0, frames: FRAMES, skipped: 0 };
+/// A straight flight, counted from when a second has shown that it is straight. With half of the
+/// skipped frames, images count in which the motion may still be any.
 const STRAIGHT: MotionCase = MotionCase { name: "straight", sigma_a: 0.0, frames: 50, skipped: 30 };
 
-/// The outcomes of every frame, of runs in which the tracker kept the target.
-fn outcomes(
-    options: ValidationOptions,
+/// Flights of one silhouette in one noise, and the tracker that follows them.
+struct TrackedFlight<'a> {
     flight: MotionCase,
+    stamp: Stamp,
     sides: [usize; 2],
     sigma_n: f64,
-    config: &TrackerConfig,
-) -> Vec<Vec<TrackErrors>> {
-    let stamp = Stamp::Drawn(Silhouette::new(sides[0], sides[1]));
-    let runs = runs::all(options.runs, |run| {
-        let mut noise = Noise::new(options.seed, run);
-        let path = texts_path(&mut noise, flight.frames, flight.sigma_a);
-        let mut canvas = Canvas::new(sides);
-        let mut follower = PaperFollower::new(config.clone(), sides)?;
+    config: &'a TrackerConfig,
+}
+
+impl<'a> TrackedFlight<'a> {
+    fn new(flight: MotionCase, sides: [usize; 2], sigma_n: f64, config: &'a TrackerConfig) -> Self {
+        let stamp = Stamp::Drawn(Silhouette::new(sides[0], sides[1]));
+        Self { flight, stamp, sides, sigma_n, config }
+    }
+
+    /// The outcomes of every frame, of runs in which the tracker kept the target.
+    fn outcomes(&self, options: ValidationOptions) -> Vec<Vec<TrackErrors>> {
+        let runs = runs::all(options.runs, |run| self.outcomes_of(Noise::new(options.seed, run)));
+        runs.into_iter().flatten().filter(|run| is_kept(run, self.sides)).collect()
+    }
+
+    /// The outcomes of every frame of one run that counts; `None` if the configuration is
+    /// impossible.
+    fn outcomes_of(&self, mut noise: Noise) -> Option<Vec<TrackErrors>> {
+        let path = texts_path(&mut noise, self.flight.frames, self.flight.sigma_a);
+        let mut canvas = Canvas::new(self.sides);
+        let mut follower = PaperFollower::new(self.config.clone(), self.sides)?;
         let mut outcomes = Vec::new();
         for (frame, place) in path.iter().enumerate() {
-            let image = canvas.paint(Some(&stamp), *place, 1.0, 0.0, sigma_n, &mut noise);
+            let image = canvas.paint(Some(&self.stamp), *place, 1.0, 0.0, self.sigma_n, &mut noise);
             // The velocity at the end of the tact: the difference of places is the mean over the
             // tact.
             let velocity = velocity_at(&path, frame);
             outcomes.extend(follower.step(image, *place, velocity, &mut noise));
         }
-        outcomes.drain(..flight.skipped.min(outcomes.len()));
+        outcomes.drain(..self.flight.skipped.min(outcomes.len()));
         Some(outcomes)
-    });
-    runs.into_iter().flatten().filter(|run| is_kept(run, sides)).collect()
+    }
 }
 
 /// Whether a run never predicted the target further off than its size.
@@ -100,9 +117,12 @@ fn velocity_at(path: &[[f64; 2]], frame: usize) -> [f64; 2] {
 
 /// The mean over all frames and runs, with its error from the runs' means: the runs are
 /// independent, the frames of a run are not.
-fn over_runs(runs: &[Vec<TrackErrors>], of: impl Fn(&TrackErrors) -> Option<f64>) -> (f64, f64) {
-    let each: Vec<f64> =
-        runs.iter().map(|run| mean(&run.iter().filter_map(&of).collect::<Vec<_>>()).0).collect();
+fn over_runs(
+    runs: &[Vec<TrackErrors>],
+    of: impl Fn(&TrackErrors) -> Option<f64>,
+) -> SampleStatistic {
+    let of_run = |run: &Vec<TrackErrors>| run.iter().filter_map(&of).collect::<Vec<_>>();
+    let each: Vec<f64> = runs.iter().map(|run| mean(&of_run(run)).value).collect();
     mean(&each)
 }
 
@@ -129,7 +149,8 @@ fn honesty(options: ValidationOptions) -> Table {
             for sigma_n in [0.1, 0.2, 0.3, 0.4] {
                 let seed = options.seed.wrapping_add(1000 * rows.len() as u64);
                 let options = ValidationOptions { seed, ..options };
-                let runs = outcomes(options, flight, sides, sigma_n, &TrackerConfig::default());
+                let config = &TrackerConfig::default();
+                let runs = TrackedFlight::new(flight, sides, sigma_n, config).outcomes(options);
                 for (what, figure) in [
                     ("NIS", over_runs(&runs, |o| o.nis)),
                     ("NEES", over_runs(&runs, |o| Some(o.nees))),
@@ -145,27 +166,29 @@ fn honesty(options: ValidationOptions) -> Table {
     Table { name: "honesty", title, x: "sigma_n", y: "NIS, NEES", rows }
 }
 
+/// A figure of each outcome.
+fn each(outcomes: &[&TrackErrors], of: impl Fn(&TrackErrors) -> f64) -> Vec<f64> {
+    outcomes.iter().map(|outcome| of(outcome)).collect()
+}
+
 /// Fig. 6: 10x6 at sigma_n 0.1 in paper mode, x axis.
 fn figure_6(options: ValidationOptions) -> Table {
-    let runs = outcomes(options, TEXTS, [10, 6], 0.1, &TrackerConfig::paper());
+    let config = &TrackerConfig::paper();
+    let runs = TrackedFlight::new(TEXTS, [10, 6], 0.1, config).outcomes(options);
     let mut rows = Vec::new();
     for frame in 0..FRAMES - 2 {
-        let at = |of: &dyn Fn(&TrackErrors) -> f64| -> Vec<f64> {
-            runs.iter().filter_map(|run| run.get(frame)).map(of).collect()
-        };
+        let outcomes: Vec<&TrackErrors> = runs.iter().filter_map(|run| run.get(frame)).collect();
         let x = (frame + 2) as f64;
-        rows.push(TableRow::new(
-            "prediction, Monte Carlo",
-            x,
-            root_mean_square(&at(&|o| o.prediction[0])),
-        ));
-        let filters = mean(&at(&|o| o.prediction_variance[0].sqrt()));
+        let predicted = root_mean_square(&each(&outcomes, |o| o.prediction[0]));
+        rows.push(TableRow::new("prediction, Monte Carlo", x, predicted));
+        let filters = mean(&each(&outcomes, |o| o.prediction_variance[0].sqrt()));
         rows.push(TableRow::new("prediction, filter", x, filters));
         // "The actual SD does not exceed the theoretical SD": holds at sigma_n 0.1 (errata).
-        let actual = root_mean_square(&at(&|o| o.estimate[0]));
-        let theoretical = mean(&at(&|o| o.estimate_variance[0].sqrt()));
+        let actual = root_mean_square(&each(&outcomes, |o| o.estimate[0]));
+        let theoretical = mean(&each(&outcomes, |o| o.estimate_variance[0].sqrt()));
         rows.push(
-            TableRow::new("estimate, Monte Carlo", x, actual).limit(Limit::AtMost(theoretical.0)),
+            TableRow::new("estimate, Monte Carlo", x, actual)
+                .limit(Limit::AtMost(theoretical.value)),
         );
         rows.push(TableRow::new("estimate, filter", x, theoretical));
     }

@@ -5,7 +5,7 @@ use crossfix_simulation::{Silhouette, TEMPLATE_SIZES};
 
 use super::ValidationOptions;
 use super::runs::{self, Noise};
-use super::table::{Limit, Table, TableRow, root_mean_square};
+use super::table::{Limit, SampleStatistic, Table, TableRow, root_mean_square};
 
 /// Margin of the reference, px. The widest low-pass, 0.9 px, reaches three pixels; with half of it
 /// the reference's edge would act on the silhouette.
@@ -17,11 +17,11 @@ const CLEAN_LOW_PASS: f32 = 0.45;
 /// Number of fits here for each run of the tracker. With half of it standard errors are 1.4 times
 /// as large.
 const CHEAP: usize = 20;
-/// The bound for noise of SD 1 (errata), x and y, for the sizes in their order.
+/// The bound for noise of SD 1, x and y, px, for the sizes in their order: the errata's figures.
 const ERRATA_BOUNDS: [[f64; 2]; 4] =
     [[0.195, 0.155], [0.255, 0.197], [0.281, 0.241], [0.502, 0.392]];
 
-/// Half of the distance over which slopes are taken, px: below the eighth of a pixel of the
+/// Half of the distance over which slopes are computed, px: below the eighth of a pixel of the
 /// silhouette's own grid, so that half of it gives nearly the same.
 const SLOPE_STEP: f64 = 0.05;
 
@@ -87,15 +87,17 @@ fn error(
 
 /// The largest error on an axis without noise, over the target's phases within a pixel.
 fn worst_bias(silhouette: &Silhouette, axis: usize) -> f64 {
-    (0..400)
-        .map(|phase| {
-            // 20 x 20 phases, a twentieth of a pixel apart.
-            let offset = [(phase % 20) as f64 / 20.0 - 0.475, (phase / 20) as f64 / 20.0 - 0.475];
-            let image = picture(silhouette, MARGIN + 2, offset);
-            let reference = picture(silhouette, MARGIN, [0.0; 2]);
-            error(&image, &reference, CLEAN_LOW_PASS, None, offset).0[axis].abs()
-        })
-        .fold(0.0, f64::max)
+    // 20 x 20 phases, a twentieth of a pixel apart.
+    let phases = (0..400)
+        .map(|phase| [(phase % 20) as f64 / 20.0 - 0.475, (phase / 20) as f64 / 20.0 - 0.475]);
+    phases.map(|phase| bias(silhouette, phase)[axis].abs()).fold(0.0, f64::max)
+}
+
+/// The error of a fit without noise to a target at a phase within a pixel, px.
+fn bias(silhouette: &Silhouette, phase: [f64; 2]) -> [f64; 2] {
+    let image = picture(silhouette, MARGIN + 2, phase);
+    let reference = picture(silhouette, MARGIN, [0.0; 2]);
+    error(&image, &reference, CLEAN_LOW_PASS, None, phase).0
 }
 
 /// The errors of fits to pictures at random phases, less the bias at that phase, which has a row of
@@ -107,25 +109,32 @@ fn fits(
     noisy: bool,
 ) -> Vec<[f64; 2]> {
     runs::all(CHEAP * options.runs, |run| {
-        let mut noise = Noise::new(options.seed, run);
-        let offset = [noise.uniform() - 0.5, noise.uniform() - 0.5];
-        let clean =
-            [picture(silhouette, MARGIN + 2, offset), picture(silhouette, MARGIN, [0.0; 2])];
-        let [mut image, mut reference] = clean.clone();
-        noise.add_to(image.samples_mut(), sigma_n as f32);
-        if noisy {
-            noise.add_to(reference.samples_mut(), sigma_n as f32);
-        }
-        let low_pass = if noisy { noisy_low_pass(sigma_n) } else { CLEAN_LOW_PASS };
-        // The bias at this phase is subtracted: it has a row of its own. The contrast is given, as
-        // the bound assumes it known.
-        let (bias, contrast) = error(&clean[0], &clean[1], low_pass, None, offset);
-        let ([x, y], _) = error(&image, &reference, low_pass, Some(contrast), offset);
-        [x - bias[0], y - bias[1]]
+        unbiased_error(silhouette, sigma_n, noisy, Noise::new(options.seed, run))
     })
 }
 
-/// The axes' names.
+/// The error of one fit to pictures at a random phase, less the bias at that phase.
+fn unbiased_error(
+    silhouette: &Silhouette,
+    sigma_n: f64,
+    noisy: bool,
+    mut noise: Noise,
+) -> [f64; 2] {
+    let offset = [noise.uniform() - 0.5, noise.uniform() - 0.5];
+    let clean = [picture(silhouette, MARGIN + 2, offset), picture(silhouette, MARGIN, [0.0; 2])];
+    let [mut image, mut reference] = clean.clone();
+    noise.add_to(image.samples_mut(), sigma_n as f32);
+    if noisy {
+        noise.add_to(reference.samples_mut(), sigma_n as f32);
+    }
+    let low_pass = if noisy { noisy_low_pass(sigma_n) } else { CLEAN_LOW_PASS };
+    // The contrast is given, as the bound assumes it known.
+    let (bias, contrast) = error(&clean[0], &clean[1], low_pass, None, offset);
+    let ([x, y], _) = error(&image, &reference, low_pass, Some(contrast), offset);
+    [x - bias[0], y - bias[1]]
+}
+
+/// The axes' names, in their order.
 const AXES: [&str; 2] = ["x", "y"];
 
 /// Rows of the three tables.
@@ -156,10 +165,10 @@ impl PositioningRows {
         for axis in 0..2 {
             let name = name(silhouette, axis);
             let near = Limit::Near { value: errata[axis], tolerance: 0.02 * errata[axis] };
-            self.ratios
-                .push(TableRow::new(format!("bound {name}"), 1.0, (bound[axis], 0.0)).limit(near));
-            let worst = worst_bias(silhouette, axis);
-            self.bias.push(TableRow::new(name, 0.0, (worst, 0.0)).limit(Limit::AtMost(0.01)));
+            let exact = SampleStatistic::exact(bound[axis]);
+            self.ratios.push(TableRow::new(format!("bound {name}"), 1.0, exact).limit(near));
+            let worst = SampleStatistic::exact(worst_bias(silhouette, axis));
+            self.bias.push(TableRow::new(name, 0.0, worst).limit(Limit::AtMost(0.01)));
         }
     }
 }
@@ -172,28 +181,29 @@ fn name(silhouette: &Silhouette, axis: usize) -> String {
 
 /// Row of the normalised error, 2 sigma over the side (Herasymenko 2021, eq. 16). The paper claims
 /// it to be below a pixel.
-fn accuracy(
-    series: &str,
-    sigma_n: f64,
-    (deviation, standard_error): (f64, f64),
-    side: usize,
-) -> TableRow {
+fn accuracy(series: &str, sigma_n: f64, error: SampleStatistic, side: usize) -> TableRow {
     let normalised = 2.0 / side as f64;
-    TableRow::new(series, sigma_n, (deviation * normalised, standard_error * normalised))
+    let ours = SampleStatistic {
+        value: error.value * normalised,
+        standard_error: error.standard_error * normalised,
+    };
+    TableRow::new(series, sigma_n, ours)
 }
 
 /// Row of the error over the bound, which is that for noise of SD 1.
 fn over_bound(
     series: String,
     sigma_n: f64,
-    (deviation, standard_error): (f64, f64),
+    error: SampleStatistic,
     bound: f64,
     noisy: bool,
 ) -> TableRow {
     // Two noisy pictures determine their offset root 2 less well than one noisy and one clean.
     let best = bound * sigma_n * if noisy { std::f64::consts::SQRT_2 } else { 1.0 };
     let asked = Limit::AtMost(if noisy { 1.35 } else { 1.10 });
-    TableRow::new(series, sigma_n, (deviation / best, standard_error / best)).limit(asked)
+    let ours =
+        SampleStatistic { value: error.value / best, standard_error: error.standard_error / best };
+    TableRow::new(series, sigma_n, ours).limit(asked)
 }
 
 /// Fig. 5 with clean and noisy reference, and the bias over the phases of a pixel.

@@ -50,9 +50,26 @@ pub struct TableRow {
     pub standard_error: f64,
 }
 
+/// A figure from Monte Carlo runs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SampleStatistic {
+    /// The figure.
+    pub value: f64,
+    /// Its standard error; 0 where nothing is random.
+    pub standard_error: f64,
+}
+
+impl SampleStatistic {
+    /// A figure in which nothing is random.
+    pub fn exact(value: f64) -> Self {
+        Self { value, standard_error: 0.0 }
+    }
+}
+
 impl TableRow {
     /// A row with our figure alone.
-    pub fn new(series: impl Into<String>, x: f64, (ours, standard_error): (f64, f64)) -> Self {
+    pub fn new(series: impl Into<String>, x: f64, ours: SampleStatistic) -> Self {
+        let SampleStatistic { value: ours, standard_error } = ours;
         Self {
             series: series.into(),
             x,
@@ -124,44 +141,46 @@ impl Table {
 
 /// The mean of samples with its standard error; without samples it is not a number, which meets no
 /// limit.
-pub(crate) fn mean(samples: &[f64]) -> (f64, f64) {
+pub(crate) fn mean(samples: &[f64]) -> SampleStatistic {
     let count = samples.len() as f64;
     let mean = samples.iter().sum::<f64>() / count;
     let variance = samples.iter().map(|s| (s - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
-    (mean, (variance / count).sqrt())
+    SampleStatistic { value: mean, standard_error: (variance / count).sqrt() }
 }
 
 /// The root of the mean square of samples with its standard error.
-pub(crate) fn root_mean_square(samples: &[f64]) -> (f64, f64) {
+pub(crate) fn root_mean_square(samples: &[f64]) -> SampleStatistic {
     let squares: Vec<f64> = samples.iter().map(|s| s * s).collect();
-    let (square, error) = mean(&squares);
+    let SampleStatistic { value: square, standard_error: error } = mean(&squares);
     let root = square.sqrt();
     // By linearisation: d(root) = d(square) / (2 root).
-    (root, if root > 0.0 { error / (2.0 * root) } else { 0.0 })
+    let standard_error = if root > 0.0 { error / (2.0 * root) } else { 0.0 };
+    SampleStatistic { value: root, standard_error }
 }
 
 /// The root of the ratio of two mean squares over the same runs, with its standard error.
-pub(crate) fn root_ratio(squares: &[f64], other_squares: &[f64]) -> (f64, f64) {
-    let (above, below) = (mean(squares).0, mean(other_squares).0);
+pub(crate) fn root_ratio(squares: &[f64], other_squares: &[f64]) -> SampleStatistic {
+    let (above, below) = (mean(squares).value, mean(other_squares).value);
     let root = (above / below).sqrt();
     // By linearisation; both means are of the same runs, so their errors are correlated.
     let off: Vec<f64> =
         squares.iter().zip(other_squares).map(|(a, b)| a / above - b / below).collect();
-    (root, root / 2.0 * mean(&off).1)
+    SampleStatistic { value: root, standard_error: root / 2.0 * mean(&off).standard_error }
 }
 
 /// The standard deviation of samples with its standard error.
-pub(crate) fn deviation(samples: &[f64]) -> (f64, f64) {
-    let (middle, _) = mean(samples);
+pub(crate) fn deviation(samples: &[f64]) -> SampleStatistic {
+    let middle = mean(samples).value;
     let off: Vec<f64> = samples.iter().map(|s| s - middle).collect();
     root_mean_square(&off)
 }
 
 /// The share of runs in which something happened, with its standard error.
-pub(crate) fn share(happened: impl Iterator<Item = bool>) -> (f64, f64) {
+pub(crate) fn share(happened: impl Iterator<Item = bool>) -> SampleStatistic {
     let samples: Vec<f64> = happened.map(|h| f64::from(u8::from(h))).collect();
-    let (p, _) = mean(&samples);
-    (p, (p * (1.0 - p) / samples.len().max(1) as f64).sqrt())
+    let p = mean(&samples).value;
+    let standard_error = (p * (1.0 - p) / samples.len().max(1) as f64).sqrt();
+    SampleStatistic { value: p, standard_error }
 }
 
 #[cfg(test)]
@@ -170,7 +189,8 @@ mod tests {
 
     #[test]
     fn verdicts_follow_the_limits() {
-        let row = |ours, limit| TableRow::new("", 0.0, (ours, 0.01)).limit(limit).verdict();
+        let ours = |value| SampleStatistic { value, standard_error: 0.01 };
+        let row = |value, limit| TableRow::new("", 0.0, ours(value)).limit(limit).verdict();
         assert_eq!(row(0.5, Limit::AtMost(0.5)), Verdict::Pass);
         assert_eq!(row(0.6, Limit::AtMost(0.5)), Verdict::Fail);
         assert_eq!(row(0.4, Limit::AtLeast(0.5)), Verdict::Fail);
@@ -178,15 +198,19 @@ mod tests {
         assert_eq!(row(1.029, near(0.001)), Verdict::Pass);
         assert_eq!(row(1.031, near(0.001)), Verdict::Fail);
         assert_eq!(row(1.031, near(0.05)), Verdict::Pass);
-        assert_eq!(TableRow::new("", 0.0, (1.0, 0.0)).verdict(), Verdict::Information);
+        assert_eq!(
+            TableRow::new("", 0.0, SampleStatistic::exact(1.0)).verdict(),
+            Verdict::Information
+        );
     }
 
     #[test]
     fn statistics_by_hand() {
-        assert_eq!(mean(&[1.0, 3.0]), (2.0, 1.0));
-        assert_eq!(root_mean_square(&[3.0, 3.0]).0, 3.0);
-        assert_eq!(root_ratio(&[4.0, 12.0], &[1.0, 3.0]), (2.0, 0.0));
-        let (p, error) = share([true, false, false, false].into_iter());
+        assert_eq!(mean(&[1.0, 3.0]), SampleStatistic { value: 2.0, standard_error: 1.0 });
+        assert_eq!(root_mean_square(&[3.0, 3.0]).value, 3.0);
+        assert_eq!(root_ratio(&[4.0, 12.0], &[1.0, 3.0]), SampleStatistic::exact(2.0));
+        let SampleStatistic { value: p, standard_error: error } =
+            share([true, false, false, false].into_iter());
         assert!((p - 0.25).abs() < 1e-12 && (error - (0.25_f64 * 0.75 / 4.0).sqrt()).abs() < 1e-12);
     }
 }

@@ -43,7 +43,7 @@ use watch::ErrorWatch;
 pub(crate) use calibration::KnownCamera;
 pub(crate) use clutter::view_sr;
 pub(crate) use noise::{LASTING_S, RecentBearings, ThirdDifferences};
-pub(crate) use pointing::Pointed;
+pub(crate) use pointing::ReportedPointing;
 pub(crate) use pose_scale::ScaleSample;
 pub(crate) use rooted::Rooted;
 pub use standing::Standing;
@@ -87,7 +87,7 @@ pub(crate) struct ClockChange {
 pub(crate) struct CameraState {
     calibrations: Calibrations,
     /// Where its mount pointed in its newest exposure, and the camera turned there.
-    pointed: Option<(Pointed, KnownCamera)>,
+    pointed: Option<(ReportedPointing, KnownCamera)>,
     pose_scale: PoseScale,
     noise: BearingNoise,
     /// Whether the reported variance is of the bearings' own noise alone, so that what is not white
@@ -139,7 +139,7 @@ impl CameraState {
             self.pointed.as_ref().is_none_or(|(before, _)| now.has_turned_from(before));
         self.pointed = Some((now, self.calibrations.now().pointed(&now)));
         if has_turned {
-            self.view = self.view.anew();
+            self.view = self.view.emptied();
         }
         has_turned
     }
@@ -168,7 +168,7 @@ impl CameraState {
     /// Writes into an exposure what is known of its camera, and takes in what it shows. Where too
     /// little has been seen to tell how many of the camera's bearings are false, `clutter_per_sr`
     /// is assumed.
-    pub(crate) fn tell(&mut self, exposure: &mut Exposure, clutter_per_sr: f64) {
+    pub(crate) fn annotate(&mut self, exposure: &mut Exposure, clutter_per_sr: f64) {
         exposure.uncertainty.pose_scale = self.pose_scale.factor();
         exposure.uncertainty.factor = self.noise_factor();
         // Where somebody has divided the noise into its parts, the bearings report the white one.
@@ -237,14 +237,14 @@ impl CameraState {
         let known = self.known();
         self.pose_scale = PoseScale::new(known.is_declared);
         self.noise = BearingNoise::default();
-        self.view = self.view.anew();
+        self.view = self.view.emptied();
         self.told_clock = None;
     }
 }
 
 /// Verdict of an exposure on its camera.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Judgement {
+pub(crate) struct Assessment {
     /// The camera's new standing, where it has changed.
     pub(crate) standing: Option<Standing>,
     /// The camera's bearings pass beside targets: its clock may be wrong.
@@ -352,14 +352,14 @@ impl Cameras {
     }
 
     /// Learns from an exposure how far its camera can be believed.
-    pub(crate) fn judge(
+    pub(crate) fn assess(
         &mut self,
         name: &CameraName,
         time: Timestamp,
         fittings: &Fittings,
-    ) -> Judgement {
+    ) -> Assessment {
         let Some(camera) = self.by_name.get_mut(name) else {
-            return Judgement::default();
+            return Assessment::default();
         };
         camera.standing.learn(time, &fittings.of_three);
         camera.misfits.learn(time, &fittings.of_two);
@@ -375,7 +375,7 @@ impl Cameras {
             let others = self.by_name.iter_mut().filter(|(other, _)| *other != name);
             others.for_each(|(_, other)| other.standing.acquit());
         }
-        Judgement { standing, suspects_clock: misfits || excluded }
+        Assessment { standing, suspects_clock: misfits || excluded }
     }
 
     /// Forgets the cameras' clutter rates: they are of another time.
@@ -384,7 +384,7 @@ impl Cameras {
     }
 
     /// Forgets what the cameras have seen stand in their views, and since when.
-    pub(crate) fn look_anew(&mut self) {
-        self.by_name.values_mut().for_each(|camera| camera.view = camera.view.anew());
+    pub(crate) fn reset_views(&mut self) {
+        self.by_name.values_mut().for_each(|camera| camera.view = camera.view.emptied());
     }
 }

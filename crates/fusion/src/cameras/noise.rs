@@ -1,5 +1,5 @@
 //! Noise of a camera's bearings, relative to what it reports: the white part, which every bearing
-//! draws anew, and the part that lasts from one bearing to the next.
+//! draws afresh, and the part that lasts from one bearing to the next.
 //!
 //! In the third difference of four bearings of one target its direction, its rate and its turning
 //! cancel, and whatever pose, clock and slow errors shift all four by. What is left of four
@@ -16,25 +16,29 @@ use nalgebra::{Unit, Vector2, Vector3};
 
 use crate::uncertainty::CorrelatedNoise;
 
-/// Median of a chi-square of two degrees of freedom.
+/// Median of a chi-square of two degrees of freedom, 2 ln 2: a property of the distribution, and
+/// no choice.
 const MEDIAN: f64 = 2.0 * LN_2;
-/// Increase of the share of draws below the median per unit of the logarithm of the scale.
+/// Increase of the share of draws below the median per unit of the logarithm of the scale: that
+/// distribution's density there. With half of it each step of the estimate is twice as long, and
+/// the estimate twice as noisy.
 const SLOPE: f64 = LN_2 / 2.0;
 /// Number of draws that the estimate remembers: it is then known to 13 %. With half as many a
 /// camera must report a third of its variance before that is noticed, and not half of it.
 const MEMORY: f64 = 200.0;
 /// Standard error of the logarithm of the scale after one draw (simulated: neighbouring draws share
-/// three of their four bearings).
+/// three of their four bearings). With half of it chance passes for twice as many standard errors,
+/// and cameras are doubted that are as good as they report.
 const ERROR_OF_ONE: f64 = 1.9;
 /// A camera whose scale is this many standard errors above 1 has more noise than it reports. With
 /// half as many one in four is doubted by chance before its first two hundred draws
 /// are over.
-const DOUBT: f64 = 3.0;
+const NOISIER: f64 = 3.0;
 /// A camera's reported variance is divided into parts if its white noise is this many standard
-/// errors below it. More than for doubt: white noise as reported, looked at thirty times a second,
-/// is four below it by chance once in a few minutes, and would be taken for noise that lasts. With
-/// half of it that happens all the time; at twice as much a camera half of whose variance lasts is
-/// left as it is.
+/// errors below it. More than for [`NOISIER`]: white noise as reported, compared thirty times per
+/// second, is four below it by chance once in a few minutes, and would be taken for noise that
+/// lasts. With half of it that happens all the time; at twice as much a camera half of whose
+/// variance lasts is left as it is.
 const DIVIDED: f64 = 4.5;
 /// The least share of the reported variance that counts as white. Labels that are interpolated, and
 /// trackers that smooth, have none at all; with a tenth of this their bearings would be believed
@@ -151,7 +155,7 @@ impl RunningScale {
         // Of labels that are interpolated all draws are next to nothing: what is below the least
         // that counts is not remembered.
         self.log_factor = next.max(LEAST_WHITE.ln());
-        let least = if self.is_less { DOUBT } else { DIVIDED };
+        let least = if self.is_less { NOISIER } else { DIVIDED };
         self.is_less = self.standard_errors() < -least;
     }
 
@@ -162,13 +166,13 @@ impl RunningScale {
 
     /// The ratio; 1 as long as it is not clear that it differs.
     fn factor(&self) -> f64 {
-        let is_clear = self.is_less || self.standard_errors() > DOUBT;
+        let is_clear = self.is_less || self.standard_errors() > NOISIER;
         if is_clear { self.log_factor.exp() } else { 1.0 }
     }
 
-    /// The largest ratio that the draws allow: [`DOUBT`] standard errors above the estimate.
+    /// The largest ratio that the draws allow: [`NOISIER`] standard errors above the estimate.
     fn most(&self) -> f64 {
-        (self.log_factor + DOUBT * ERROR_OF_ONE / self.draws.sqrt()).exp()
+        (self.log_factor + NOISIER * ERROR_OF_ONE / self.draws.sqrt()).exp()
     }
 }
 

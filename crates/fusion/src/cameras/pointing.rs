@@ -11,7 +11,7 @@ use crate::uncertainty::CorrelatedNoise;
 /// minute would count as having measured its direction many times over.
 const DWELL_S: f64 = 100.0;
 /// A mount has turned if it reports a direction this many deviations from the one before. If each
-/// reading errs anew, 2 % of them pass for a turn, after which the camera forgets what stands in
+/// reading errs afresh, 2 % of them pass for a turn, after which the camera forgets what stands in
 /// its view; with half of it more than a third would.
 const TURNED_SDS: f64 = 4.0;
 /// Angles that differ by less than this are the same, rad: what is left of a number on its way.
@@ -23,7 +23,7 @@ const WORST_SD_RAD: f64 = 1.0;
 
 /// Where a camera on a mount pointed in an exposure.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Pointed {
+pub(crate) struct ReportedPointing {
     angles: ScanAngles,
     /// Standard deviation of the direction along the axis that is known worse, rad.
     sd_rad: f64,
@@ -31,7 +31,7 @@ pub(crate) struct Pointed {
     pub(crate) is_settled: bool,
 }
 
-impl Pointed {
+impl ReportedPointing {
     /// Reads the pointing of a frame; `None` if it is impossible.
     pub(crate) fn read(message: &Pointing) -> Option<Self> {
         let angles = message.angles()?;
@@ -52,7 +52,7 @@ impl Pointed {
 
 impl KnownCamera {
     /// The camera turned to where its mount points; unchanged if no mount turns it.
-    pub(crate) fn pointed(&self, pointed: &Pointed) -> Self {
+    pub(crate) fn pointed(&self, pointed: &ReportedPointing) -> Self {
         let Some(mount) = &self.mount else { return self.clone() };
         Self {
             camera: self.camera.posed(mount.pose(pointed.angles)),
@@ -65,7 +65,7 @@ impl KnownCamera {
 
 /// Lasting noise of a camera's bearings together with the error of its mount's angles: the larger
 /// of the two determines how long it lasts.
-fn with_pointing(lasting: CorrelatedNoise, pointed: &Pointed) -> CorrelatedNoise {
+fn with_pointing(lasting: CorrelatedNoise, pointed: &ReportedPointing) -> CorrelatedNoise {
     let time_s = if pointed.sd_rad > lasting.sd_rad { DWELL_S } else { lasting.time_s };
     CorrelatedNoise { sd_rad: lasting.sd_rad.hypot(pointed.sd_rad), time_s }
 }

@@ -53,21 +53,30 @@ const NOTICED: f64 = 0.1;
 #[derive(Clone, Debug)]
 pub(crate) struct ScaleSample {
     pub(crate) camera: CameraName,
-    /// Mean offset of its bearings from the track, rad.
-    pub(crate) offset: Vector2<f64>,
-    /// Derivative of the offset by the target's place, rad/m.
+    /// Mean residual of its bearings from the track, rad.
+    pub(crate) residual: Vector2<f64>,
+    /// Derivative of the residual by the target's place, rad/m.
     pub(crate) by_position: Matrix2x3<f64>,
-    /// Covariance of the mean offset by noise alone, rad^2.
+    /// Covariance of the mean residual by noise alone, rad^2.
     pub(crate) noise: Matrix2<f64>,
-    /// Shift of the offset by the declared pose error: a root of its covariance, rad.
+    /// Shift of the residual by the declared pose error: a root of its covariance, rad.
     pub(crate) pose: Matrix2<f64>,
-    /// Derivative of the offset by the camera's rotation (rad/rad) and place (rad/m).
+    /// Derivative of the residual by the camera's rotation (rad/rad) and place (rad/m).
     pub(crate) by_pose: Matrix2x6<f64>,
-    /// Shift of the offset by one deviation of the camera's clock, rad.
+    /// Shift of the residual by one deviation of the camera's clock, rad.
     pub(crate) clock: Vector2<f64>,
     /// Covariance of white noise per draw that averages out as slowly, rad^2: part of the noise
     /// lasts from one draw to the next, and `clock` is only as sure as the velocity.
     pub(crate) slow_noise: Matrix2<f64>,
+}
+
+/// The squared pose error of a camera by one draw, in units of the declared deviation.
+#[derive(Clone, Copy, Debug)]
+struct SquaredPoseError {
+    /// What explains the camera's part of the draw.
+    found: f64,
+    /// Its expectation.
+    expected: f64,
 }
 
 /// Factor on a camera's pose covariance, and what it is learnt from.
@@ -110,9 +119,10 @@ impl PoseScale {
         (self.expected > 0.0).then_some(step)
     }
 
-    /// Takes in the squared pose error that a draw has found, and its expectation, with the typical
-    /// factor of the site's cameras; returns by how much the tracks' factor changes, if it does.
-    fn learn(&mut self, found: f64, expected: f64, typical: f64) -> Option<f64> {
+    /// Takes in the squared pose error of a draw, with the typical factor of the site's cameras;
+    /// returns by how much the tracks' factor changes, if it does.
+    fn learn(&mut self, error: SquaredPoseError, typical: f64) -> Option<f64> {
+        let SquaredPoseError { found, expected } = error;
         if !(found.is_finite() && expected.is_finite() && expected > 0.0) {
             return None;
         }
@@ -149,14 +159,14 @@ impl Cameras {
     /// Takes in what cameras have seen of a target; returns those whose pose's factor has changed,
     /// each with the ratio.
     pub(crate) fn learn_poses(&mut self, samples: &[ScaleSample]) -> Vec<(CameraName, f64)> {
-        let Some(found) = self.found_and_expected(samples) else {
+        let Some(errors) = self.squared_errors(samples) else {
             return Vec::new();
         };
         let typical = self.typical_scale(samples);
-        let drawn = samples.iter().zip(found);
-        let changed = drawn.filter_map(|(sample, (found, expected))| {
+        let drawn = samples.iter().zip(errors);
+        let changed = drawn.filter_map(|(sample, error)| {
             let scale = &mut self.get_mut(&sample.camera)?.pose_scale;
-            Some((sample.camera.clone(), scale.learn(found, expected, typical)?))
+            Some((sample.camera.clone(), scale.learn(error, typical)?))
         });
         changed.collect()
     }
@@ -173,12 +183,13 @@ impl Cameras {
         (value + median(steps.collect())).exp()
     }
 
-    /// For each camera, by its factor: the squared pose error that explains its part of a draw, and
-    /// the expectation of it.
-    fn found_and_expected(&self, samples: &[ScaleSample]) -> Option<Vec<(f64, f64)>> {
-        let scale = |sample: &ScaleSample| {
-            self.get(&sample.camera).map_or(1.0, |camera| camera.pose_scale.value)
-        };
+    fn pose_scale_of(&self, camera: &CameraName) -> f64 {
+        self.get(camera).map_or(1.0, |camera| camera.pose_scale.value)
+    }
+
+    /// The squared pose error of each camera, by its factor.
+    fn squared_errors(&self, samples: &[ScaleSample]) -> Option<Vec<SquaredPoseError>> {
+        let scale = |sample: &ScaleSample| self.pose_scale_of(&sample.camera);
         let weight =
             |s: &ScaleSample| (s.noise + s.pose * s.pose.transpose() * scale(s)).try_inverse();
         let weights: Vec<Matrix2<f64>> = samples.iter().map(weight).collect::<Option<_>>()?;
@@ -186,15 +197,17 @@ impl Cameras {
         for (sample, weight) in samples.iter().zip(&weights) {
             let weighed = sample.by_position.transpose() * weight;
             information += weighed * sample.by_position;
-            pull += weighed * sample.offset;
+            pull += weighed * sample.residual;
         }
         // The weighted least-squares place (A' W A)^-1 A' W z, and P = W - W A (A' W A)^-1 A' W,
         // which takes from a residual what the place has explained: REML.
         let spread = information.try_inverse()?;
         let place = spread * pull;
         let of_cameras = samples.iter().zip(&weights).map(|(sample, weight)| {
-            let (found, expected) = sample.found_and_expected(weight, &place, &spread);
-            (found * scale(sample), expected * scale(sample))
+            let SquaredPoseError { found, expected } =
+                sample.squared_error(weight, &place, &spread);
+            let scale = scale(sample);
+            SquaredPoseError { found: found * scale, expected: expected * scale }
         });
         Some(of_cameras.collect())
     }
@@ -208,18 +221,21 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 impl ScaleSample {
-    /// As [`Cameras::found_and_expected`], for one camera with a factor of 1, given the best place
-    /// and its covariance.
-    fn found_and_expected(
+    /// As [`Cameras::squared_errors`], for one camera with a factor of 1, given the best place and
+    /// its covariance.
+    fn squared_error(
         &self,
         weight: &Matrix2<f64>,
         place: &Vector3<f64>,
         spread: &Matrix3<f64>,
-    ) -> (f64, f64) {
-        let Self { offset, by_position, pose, .. } = self;
+    ) -> SquaredPoseError {
+        let Self { residual, by_position, pose, .. } = self;
         // With pose root L and factor s: found s |L' W (z - A x)|^2, expected s tr(L' P L).
-        let error = pose.transpose() * weight * (offset - by_position * place);
+        let error = pose.transpose() * weight * (residual - by_position * place);
         let told = weight - weight * by_position * spread * by_position.transpose() * weight;
-        (error.norm_squared(), (pose.transpose() * told * pose).trace())
+        SquaredPoseError {
+            found: error.norm_squared(),
+            expected: (pose.transpose() * told * pose).trace(),
+        }
     }
 }

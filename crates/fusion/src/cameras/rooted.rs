@@ -2,6 +2,8 @@
 //! Detectors report such objects again and again in the same place, and the lines of two cameras to
 //! two of them cross as a target's do.
 
+use std::cmp::Ordering;
+
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector3};
@@ -58,6 +60,18 @@ struct ReportedPlace {
     before: f64,
 }
 
+impl ReportedPlace {
+    /// Order in which places are forgotten.
+    fn by_reports(&self, other: &Self) -> Ordering {
+        self.reports.total_cmp(&other.reports).then(other.first.cmp(&self.first))
+    }
+
+    /// Square of the chord from its middle to a direction: at these angles, the angle itself.
+    fn chord_squared(&self, direction: Unit<Vector3<f64>>) -> f64 {
+        (self.middle.into_inner() - direction.into_inner()).norm_squared()
+    }
+}
+
 /// The places in a camera's view from which it has reported something lately.
 #[derive(Clone, Debug)]
 pub(crate) struct ReportedPlaces {
@@ -76,7 +90,7 @@ impl ReportedPlaces {
     }
 
     /// The view of a camera that begins to look again.
-    pub(super) fn anew(&self) -> Self {
+    pub(super) fn emptied(&self) -> Self {
         Self::new(self.rooted_s)
     }
 
@@ -98,11 +112,8 @@ impl ReportedPlaces {
 
     /// Forgets the place that has been reported least often; of several, the newest one.
     fn forget_one(&mut self) {
-        let order = |one: &ReportedPlace, other: &ReportedPlace| {
-            one.reports.total_cmp(&other.reports).then(other.first.cmp(&one.first))
-        };
         let places = self.places.iter().enumerate();
-        if let Some((index, _)) = places.min_by(|(_, one), (_, other)| order(one, other)) {
+        if let Some((index, _)) = places.min_by(|(_, one), (_, other)| one.by_reports(other)) {
             self.places.swap_remove(index);
         }
     }
@@ -117,11 +128,7 @@ impl ReportedPlaces {
         let rooted_s = self.rooted_s;
         // What is there when a camera begins to look may have been there for long.
         let may_be_old = |first: Timestamp| first.seconds_since(began) < BEGINNING * rooted_s;
-        // Chord between unit vectors: at these angles, the angle itself.
-        let distance = |place: &ReportedPlace| {
-            (place.middle.into_inner() - line.direction.into_inner()).norm_squared()
-        };
-        let near = self.places.iter_mut().map(|place| (distance(place), place));
+        let near = self.places.iter_mut().map(|place| (place.chord_squared(line.direction), place));
         let nearest =
             near.filter(|(away, _)| *away <= REACH_RAD.powi(2)).min_by(|a, b| a.0.total_cmp(&b.0));
         let Some((_, place)) = nearest else {

@@ -88,8 +88,8 @@ impl StandingEvidence {
     }
 }
 
-/// StandingRecord of a camera by one kind of evidence; `None` as long as there was nothing to compare it
-/// with.
+/// The record of a camera by one kind of evidence; `None` as long as there was nothing to
+/// compare it with.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct StandingRecord(Option<StandingEvidence>);
 

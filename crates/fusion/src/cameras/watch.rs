@@ -20,7 +20,7 @@ use memory::{ErrorEstimate, Memory};
 /// Time constants of the memories, s in which targets are seen: a camera was moved that long ago,
 /// or longer, each as likely. A large turn shows in the shorter time, while most of the longer one
 /// would be from before it; a small turn, or that of a camera whose bearings are noisy, takes the
-/// longer time to be sure.
+/// longer time to be sure. With half of both a turn must be 1.4 times as large to be sure of.
 const MEMORIES_S: [f64; 2] = [20.0, 100.0];
 /// Longest time that counts between two successive draws, s: in a pause without a target nothing is
 /// learnt. With half of it the same: a draw lasts a third of a second.
@@ -33,7 +33,8 @@ const KNOCKS_RAD: [f64; 4] = [1e-3, 3e-3, 1e-2, 3e-2];
 /// it the sun would move cameras whose pose is declared exact.
 const LEAST_TURN_RAD: f64 = 1e-4;
 /// Least deviation of its position, m. Where an exact pose is declared, nothing else would allow
-/// for the errors that a lens leaves.
+/// for the errors that a lens leaves; with half of it those of targets near the camera may count as
+/// a move.
 const LEAST_SHIFT_M: f64 = 2e-3;
 /// Degrees of freedom of Student's t: lines that miss each other by far more than anything explains
 /// are of two targets, and have the weight that this distribution gives them. With half of it such
@@ -49,8 +50,8 @@ const SURE: f64 = 6.9;
 /// (logarithm): one in a hundred. With half of it one that is ten times less likely is cleared.
 const DISTINCT: f64 = 4.6;
 
-/// Fewer cameras do not check one another: an error in the plane of two sight lines shows in
-/// neither.
+/// Fewer cameras do not check one another: with two, an error in the plane of their sight lines
+/// shows in neither.
 const LEAST_TOGETHER: usize = 3;
 
 /// Number of errors of a camera: rotation, place and clock, each in units of its own deviation.
@@ -172,9 +173,6 @@ impl Watched {
         // The posterior with the wide prior in place of the narrow one, which has unit variance.
         let wide = (known - SMatrix::identity() + prior).cholesky()?;
         let moved = wide.solve(&(known * mean));
-        let log_determinant = |factor: &SMatrix<f64, ERRORS, ERRORS>| {
-            2.0 * factor.diagonal().iter().map(|root| root.ln()).sum::<f64>()
-        };
         // 2 ln odds = ln|P| - ln|C| - ln|A| + h' (x_wide - x), with the wide prior's precision P,
         // the narrow posterior's covariance C, the wide posterior's precision A, and the lines'
         // pull h on the errors.
@@ -196,6 +194,11 @@ impl Watched {
             or_else: Vec::new(),
         })
     }
+}
+
+/// Logarithm of the determinant of L L', from L.
+fn log_determinant(factor: &SMatrix<f64, ERRORS, ERRORS>) -> f64 {
+    2.0 * factor.diagonal().iter().map(|root| root.ln()).sum::<f64>()
 }
 
 impl ErrorWatch {
@@ -271,7 +274,7 @@ impl ErrorWatch {
         // I_ij = [i = j] B_i' W_i B_i - B_i' W_i A_i S A_j' W_j B_j.
         for (i, one) in places.iter().enumerate() {
             let own = by_errors[i].transpose() * weights[i];
-            let away = samples[i].offset - samples[i].by_position * meeting.place;
+            let away = samples[i].residual - samples[i].by_position * meeting.place;
             for memory in &mut self.memories {
                 let mut pull = memory.pull.fixed_rows_mut::<ERRORS>(ERRORS * one);
                 pull += own * away * weight;
@@ -336,12 +339,12 @@ impl Meeting {
         for (sample, weight) in samples.iter().zip(weights) {
             let weighed = sample.by_position.transpose() * weight;
             information += weighed * sample.by_position;
-            pull += weighed * sample.offset;
+            pull += weighed * sample.residual;
         }
         let spread = information.try_inverse()?;
         let place = spread * pull;
         let squares = samples.iter().zip(weights).map(|(sample, weight)| {
-            let missed = sample.offset - sample.by_position * place;
+            let missed = sample.residual - sample.by_position * place;
             missed.dot(&(weight * missed))
         });
         Some(Self { place, spread, squares: squares.sum() })
@@ -380,7 +383,7 @@ mod tests {
             let model = BearingModel::new(origin, place).unwrap();
             ScaleSample {
                 camera: name.parse().unwrap(),
-                offset: model.by_pose().fixed_columns::<3>(0) * turn,
+                residual: model.by_pose().fixed_columns::<3>(0) * turn,
                 by_position: model.by_position(),
                 noise: Matrix2::identity() * 1e-8,
                 pose: Matrix2::identity() * 3e-4,

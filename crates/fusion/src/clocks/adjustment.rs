@@ -1,24 +1,19 @@
 //! Adjustment of a window: fits the target's trajectory, the clocks and the poses to its bearings
 //! together.
 
+mod loss;
 mod target;
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 use super::batch_means::BatchMeans;
-use super::curve::{Basis, Curve, TimedPlace};
+use super::curve::{Basis, Curve, CurvePoint, TimedPlace};
 use super::window::WindowBearing;
+use loss::{BearingLoss, Loss, OUTLIER};
 use target::{PlaceShift, PlaceShifts, PredictedTarget};
 
-/// Squared Mahalanobis distance (two degrees of freedom) beyond which a bearing pulls no harder, in
-/// the first descent, when all may be far off. With half of it one in ten of the target's own pulls
-/// too little.
-const HUBER: f64 = 9.0;
-/// Squared distance beyond which a bearing does not pull at all, in the later descents: it is
-/// of another object (1 in 60 000 of the target's own lies beyond; with half of it 1 in
-/// 245).
-const OUTLIER: f64 = 22.0;
-/// Median of a squared distance of two degrees of freedom.
+/// Median of a squared distance of two degrees of freedom, 2 ln 2. With half of it cameras would be
+/// taken to be twice as noisy as they are.
 const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
 /// Largest factor on a camera's covariances: larger residuals are due to a mistake, not to noise,
 /// and are not made likely by taking them for noise. With half of it a camera that reports a third
@@ -27,34 +22,35 @@ pub(super) const MAX_SCALE: f64 = 16.0;
 /// Most iterations of one descent, which bounds its time; most take three to six, and half of it
 /// would do for these.
 const MAX_ROUNDS: usize = 25;
-/// Levenberg-Marquardt damping relative to the diagonal: at first, and when a descent is given up.
-/// With half of either the same: it changes by factors of ten.
+/// Levenberg-Marquardt damping relative to the diagonal, at first. With half of it the same: it
+/// changes by factors of ten.
 const FIRST_DAMPING: f64 = 1e-4;
+/// Damping at which a descent is given up: its steps are ten thousandths by then. With half of it
+/// the same, for the same reason.
 const MAX_DAMPING: f64 = 1e4;
 /// A descent ends when the sum of squared distances falls by less than this. With half, the same.
 const SETTLED: f64 = 1e-3;
 /// Densities of the jerk that are tried, m^2/s^5, powers of ten: straight lines to racing drones.
+/// With half of the upper end the fit of a racing drone takes its turns for errors of the clocks.
 const DENSITIES: std::ops::RangeInclusive<i32> = -5..=4;
 
-/// Robust loss: how hard a bearing pulls.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Loss {
-    Huber,
-    Trimmed,
+/// The time of a bearing.
+#[derive(Clone, Copy, Debug)]
+struct BearingTime {
+    /// By the reference's clock, s.
+    reference_s: f64,
+    /// After the prior's epoch by the camera's own clock, s.
+    since_epoch_s: f64,
 }
 
-impl Loss {
-    /// Cost of a squared distance, and the weight of its bearing.
-    fn of(self, squared: f64) -> (f64, f64) {
-        match self {
-            Self::Huber if squared > HUBER => {
-                // rho(q) = 2 sqrt(H q) - H, w = rho' = sqrt(H / q).
-                (2.0 * (HUBER * squared).sqrt() - HUBER, (HUBER / squared).sqrt())
-            }
-            Self::Trimmed if squared > OUTLIER => (OUTLIER, 0.0),
-            _ => (squared, 1.0),
-        }
-    }
+/// The most likely state with one density of the jerk.
+#[derive(Clone, Debug)]
+struct DensityFit {
+    state: WindowState,
+    /// As [`DENSITIES`].
+    density: i32,
+    /// Twice the log evidence (Laplace's), up to a constant.
+    evidence: f64,
 }
 
 /// Indices of a camera's unknowns among the components of the prior.
@@ -140,10 +136,11 @@ impl<'a> Adjustment<'a> {
         // then on, lets those of other objects go.
         let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
         self.rescale(&state, Loss::Huber);
-        let (mut state, mut density, mut evidence) = self.best_density(state, density)?;
-        if self.rescale(&state, Loss::Trimmed) {
-            (state, density, evidence) = self.best_density(state, density)?;
+        let mut best = self.best_density(state, density)?;
+        if self.rescale(&best.state, Loss::Trimmed) {
+            best = self.best_density(best.state, best.density)?;
         }
+        let DensityFit { state, density, evidence } = best;
         let inflations = self.inflations(&state);
         let outlier_shares =
             self.squares(&state).iter().map(|squares| outlier_share(squares)).collect();
@@ -218,19 +215,19 @@ impl<'a> Adjustment<'a> {
     /// places.
     fn begin(&self) -> Option<WindowState> {
         let cameras = self.prior.mean.clone();
-        let places = self.sights.iter().map(|sight| {
-            let (time_s, _) = self.time(sight, &cameras);
-            TimedPlace { time_s, place: sight.place }
+        let places = self.sights.iter().map(|sight| TimedPlace {
+            time_s: self.time(sight, &cameras).reference_s,
+            place: sight.place,
         });
         Some(WindowState { coefficients: self.curve.fit(places, 1.0)?, cameras })
     }
 
-    /// Time of a bearing by the reference's clock, s, and its time after the prior's epoch, s.
-    fn time(&self, sight: &WindowBearing, cameras: &DVector<f64>) -> (f64, f64) {
-        let since = sight.time_s - self.prior.epoch_s;
+    /// Time of a bearing with the clocks of a state.
+    fn time(&self, sight: &WindowBearing, cameras: &DVector<f64>) -> BearingTime {
+        let since_epoch_s = sight.time_s - self.prior.epoch_s;
         let clock = self.prior.cameras[sight.camera].clock;
-        let offset = clock.map_or(0.0, |place| cameras[place] + cameras[place + 1] * since);
-        (sight.time_s - offset, since)
+        let offset = clock.map_or(0.0, |place| cameras[place] + cameras[place + 1] * since_epoch_s);
+        BearingTime { reference_s: sight.time_s - offset, since_epoch_s }
     }
 
     /// The target of a bearing. A clock that is ahead by o shows the target where it was o ago: the
@@ -238,15 +235,15 @@ impl<'a> Adjustment<'a> {
     /// epoch. A camera whose stated pose is turned by d and moved by c against its true one has the
     /// target at p + d x (p - origin) + c.
     fn target(&self, sight: &WindowBearing, state: &WindowState) -> PredictedTarget {
-        let (time_s, since) = self.time(sight, &state.cameras);
-        let basis = self.curve.basis(time_s);
+        let BearingTime { reference_s, since_epoch_s } = self.time(sight, &state.cameras);
+        let basis = self.curve.basis(reference_s);
         // p(t - o - d t'): dp/do = -v, dp/dd = -v t', with t' the time since the epoch.
-        let (mut place, velocity) = basis.at(&state.coefficients);
+        let CurvePoint { mut place, velocity } = basis.at(&state.coefficients);
         let Unknowns { clock, pose } = self.prior.cameras[sight.camera];
         let mut shifts = PlaceShifts::default();
         if let Some(first) = clock {
             shifts.add(first, -velocity);
-            shifts.add(first + 1, -velocity * since);
+            shifts.add(first + 1, -velocity * since_epoch_s);
         }
         if let Some(first) = pose {
             let away = place - sight.line.origin.coords;
@@ -263,24 +260,21 @@ impl<'a> Adjustment<'a> {
         PredictedTarget { basis, place, shifts }
     }
 
-    /// Climbs to the jerk density of the greatest evidence; returns its state, density and
-    /// evidence.
-    fn best_density(&self, state: WindowState, first: i32) -> Option<(WindowState, i32, f64)> {
-        let (state, evidence) = self.with_evidence(state, first)?;
-        let mut best = (state, first, evidence);
+    /// Climbs to the jerk density of the greatest evidence.
+    fn best_density(&self, state: WindowState, first: i32) -> Option<DensityFit> {
+        let mut best = self.with_evidence(state, first)?;
         for step in [-1, 1] {
             let mut moved = false;
-            while DENSITIES.contains(&(best.1 + step)) {
-                let Some((state, evidence)) = self.with_evidence(best.0.clone(), best.1 + step)
-                else {
+            while DENSITIES.contains(&(best.density + step)) {
+                let Some(next) = self.with_evidence(best.state.clone(), best.density + step) else {
                     break;
                 };
                 // It climbs one way only, as long as the evidence grows: a second maximum is not
-                // looked for.
-                if evidence <= best.2 {
+                // searched for.
+                if next.evidence <= best.evidence {
                     break;
                 }
-                best = (state, best.1 + step, evidence);
+                best = next;
                 moved = true;
             }
             if moved {
@@ -290,8 +284,8 @@ impl<'a> Adjustment<'a> {
         Some(best)
     }
 
-    /// Descends; returns the state and twice the log evidence (Laplace's), up to a constant.
-    fn with_evidence(&self, state: WindowState, density: i32) -> Option<(WindowState, f64)> {
+    /// Descends with a density of the jerk.
+    fn with_evidence(&self, state: WindowState, density: i32) -> Option<DensityFit> {
         let (state, Quadratic { cost, information, .. }) =
             self.descend(state, density, Loss::Trimmed)?;
         // ln det A = 2 sum ln L_ii for A = L L'.
@@ -306,7 +300,7 @@ impl<'a> Adjustment<'a> {
         // 2 ln Z = ln det(prior precision) - cost - ln det A - widths of curve prior and bearing
         // noise.
         let evidence = log_before - cost - log_determinant - width - scales;
-        evidence.is_finite().then_some((state, evidence))
+        evidence.is_finite().then_some(DensityFit { state, density, evidence })
     }
 
     /// Levenberg-Marquardt descent to the most likely state.
@@ -361,10 +355,10 @@ impl<'a> Adjustment<'a> {
             let Some(seen) = BearingResidual::at(sight, target.place, self.scales[sight.camera])
             else {
                 // Behind the camera: as far off as can be.
-                quadratic.cost += share * loss.of(1e6).0;
+                quadratic.cost += share * loss.of(1e6).cost;
                 continue;
             };
-            let (cost, weight) = loss.of(seen.squared);
+            let BearingLoss { cost, weight } = loss.of(seen.squared);
             quadratic.cost += share * cost;
             if weight > 0.0 {
                 quadratic.add(&target, state.coefficients.len(), &seen, share * weight);

@@ -64,12 +64,12 @@ mod tests {
             Vector2::from_fn(|_, _| sd * rng.sample::<f64, _>(StandardNormal))
         };
         let mut means = BatchMeans::default();
-        let mut held = Vector2::zeros();
+        let mut last = Vector2::zeros();
         for k in 0..30 * seconds {
             if k % 60 == 0 {
-                held = normal(lasting);
+                last = normal(lasting);
             }
-            means.add(f64::from(k) / 30.0, held + normal(1.0 - lasting), allowance);
+            means.add(f64::from(k) / 30.0, last + normal(1.0 - lasting), allowance);
         }
         means.inflation()
     }

@@ -1,21 +1,25 @@
 //! Belief about the clocks: offset and drift of each relative to one of them, the reference; and
 //! about the cameras' poses, as a camera that is turned sees a moving target early or late.
 
+mod estimate;
+
 use std::collections::BTreeMap;
 
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, DVector, Matrix6};
 
-use super::ClockEstimate;
 use super::common_time::{ClockReading, Common, LIARS_SD_S, common_time};
 
-/// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz. With half of either
-/// the estimates follow a clock a little later.
+/// Random walk of an offset, s^2/s: an ordinary quartz. With half of it the estimates follow a
+/// clock a little later.
 const OFFSET_WALK: f64 = 1e-12;
+/// Random walk of a drift, 1/s, of the same quartz. With half of it the estimates follow one that
+/// warms up a little later.
 const DRIFT_WALK: f64 = 1e-16;
-/// No two clocks agree to better than this, s and s/s: it keeps their covariance regular. With half
-/// of it the same.
+/// No two clocks agree to better than this, s: it keeps their covariance regular. With half of it
+/// the same.
 const OFFSET_FLOOR_S: f64 = 1e-6;
+/// The same for their drifts, s/s. With half of it the same.
 const DRIFT_FLOOR: f64 = 1e-9;
 /// The same floor for a pose, rad and m. With half of it the same.
 const POSE_FLOOR: f64 = 1e-6;
@@ -117,18 +121,21 @@ impl Belief {
         let Some(before) = self.cameras.get(camera).map(|known| known.pose) else {
             return;
         };
-        let pose = pose.map(|covariance| {
-            let first = before.map_or_else(|| self.grow(6), |before| before.index);
-            self.mean.fixed_rows_mut::<6>(first).fill(0.0);
-            self.covariance.fixed_rows_mut::<6>(first).fill(0.0);
-            self.covariance.fixed_columns_mut::<6>(first).fill(0.0);
-            let regular = covariance + Matrix6::identity() * POSE_FLOOR.powi(2);
-            self.covariance.fixed_view_mut::<6, 6>(first, first).copy_from(&regular);
-            UnsurePose { index: first, reported: covariance }
-        });
+        let pose = pose.map(|covariance| self.replace_pose(before, covariance));
         if let Some(known) = self.cameras.get_mut(camera) {
             known.pose = pose;
         }
+    }
+
+    /// Enters a pose of this covariance in the state, where the one before was if there was one.
+    fn replace_pose(&mut self, before: Option<UnsurePose>, covariance: Matrix6<f64>) -> UnsurePose {
+        let first = before.map_or_else(|| self.grow(6), |before| before.index);
+        self.mean.fixed_rows_mut::<6>(first).fill(0.0);
+        self.covariance.fixed_rows_mut::<6>(first).fill(0.0);
+        self.covariance.fixed_columns_mut::<6>(first).fill(0.0);
+        let regular = covariance + Matrix6::identity() * POSE_FLOOR.powi(2);
+        self.covariance.fixed_view_mut::<6, 6>(first, first).copy_from(&regular);
+        UnsurePose { index: first, reported: covariance }
     }
 
     /// Enlarges the state by `by` components; returns the index of the first.
@@ -364,15 +371,15 @@ impl Belief {
 
     /// Forgets all that was learnt of any clock.
     pub(super) fn reset_all(&mut self) {
-        let mut anew = Self { epoch: self.epoch, ..Self::default() };
+        let mut reset = Self { epoch: self.epoch, ..Self::default() };
         let mut cameras: Vec<(&CameraName, &ClockEntry)> = self.cameras.iter().collect();
         // In the order in which they were heard: the reference first.
         cameras.sort_by_key(|(_, clock)| clock.index.map_or(0, |index| index + 1));
         for (camera, clock) in cameras {
             let pose = clock.pose.map(|pose| pose.reported);
-            anew.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], clock.walk, pose);
+            reset.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], clock.walk, pose);
         }
-        *self = anew;
+        *self = reset;
     }
 
     /// Recomputes each clock's share in the common time, from the offsets now.
@@ -402,44 +409,6 @@ impl Belief {
         self.epoch.map_or(0.0, |epoch| time.seconds_since(epoch))
     }
 
-    /// A clock's offset (component 0) or drift (1) relative to the common time of all clocks, with
-    /// its variance and the variance of that common time.
-    fn absolute(&self, clock: &ClockEntry, component: usize, ahead: f64) -> (f64, f64, f64) {
-        let common = match component {
-            0 => self.common.variance,
-            _ => self.shares().map(|(clock, share)| share.powi(2) * clock.drift_prior).sum(),
-        };
-        let row = self.absolute_row(clock, component, ahead);
-        let site = if component == 0 { self.site[0] + self.site[1] * ahead } else { self.site[1] };
-        let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum::<f64>() + site;
-        // Variance: h P h'.
-        let along = |(&i, a): (&usize, &f64)| -> f64 {
-            a * row.iter().map(|(&k, b)| b * self.covariance[(i, k)]).sum::<f64>()
-        };
-        let variance: f64 = row.iter().map(along).sum();
-        (mean, variance.max(0.0), common)
-    }
-
-    /// Row vector h of x_clock - sum_k share_k x_k over the state, where the offset `ahead` seconds
-    /// later is offset + ahead * drift.
-    fn absolute_row(
-        &self,
-        clock: &ClockEntry,
-        component: usize,
-        ahead: f64,
-    ) -> BTreeMap<usize, f64> {
-        let mut row: BTreeMap<usize, f64> = BTreeMap::new();
-        let others = self.shares().map(|(other, share)| (other, -share));
-        for (one, weight) in std::iter::once((clock, 1.0)).chain(others) {
-            let Some(index) = one.index.filter(|_| weight != 0.0) else { continue };
-            *row.entry(index + component).or_default() += weight;
-            if component == 0 {
-                *row.entry(index + 1).or_default() += weight * ahead;
-            }
-        }
-        row
-    }
-
     /// Whether all offsets are such as clocks may have: beyond [`MAX_OFFSET_S`] a fit went astray.
     pub(super) fn is_possible(&self) -> bool {
         self.clock_indices().all(|index| self.mean[index].abs() <= MAX_OFFSET_S)
@@ -449,39 +418,6 @@ impl Belief {
     /// `None` before any.
     pub(super) fn inflation(&self, camera: &CameraName) -> Option<f64> {
         self.cameras.get(camera)?.inflation
-    }
-
-    /// The estimate of a camera's clock at a time.
-    pub(super) fn estimate(&self, camera: &CameraName, time: Timestamp) -> Option<ClockEstimate> {
-        let clock = self.cameras.get(camera)?;
-        let ahead = self.ahead(time);
-        let (offset, own, common) = self.absolute(clock, 0, ahead);
-        let (drift, own_drift, common_drift) = self.absolute(clock, 1, ahead);
-        Some(ClockEstimate {
-            offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
-            // No clock is worse known than its report says, as far as the report is believed.
-            sd_s: (own + common)
-                .min(ClockReading { offset, variance: clock.prior }.believed(offset))
-                .sqrt(),
-            relative_sd_s: own.sqrt(),
-            drift,
-            drift_sd: (own_drift + common_drift).min(clock.drift_prior).sqrt(),
-        })
-    }
-
-    /// The largest offset of all clocks, s, at least 0: no camera's corrected time lies farther
-    /// before its reported one.
-    pub(super) fn largest_offset(&self, time: Timestamp) -> f64 {
-        let ahead = self.ahead(time);
-        let offset = |clock: &ClockEntry| self.relative(clock, 0, ahead);
-        // Relative to the common time an offset is x_k - sum share x + site, as in `absolute`.
-        let common = self.shares().map(|(clock, share)| share * offset(clock)).sum::<f64>()
-            - (self.site[0] + self.site[1] * ahead);
-        self.cameras
-            .values()
-            .map(|clock| offset(clock) - common)
-            .fold(0.0, f64::max)
-            .min(MAX_OFFSET_S)
     }
 
     /// Offset and drift of the reference from true time at the epoch.

@@ -74,6 +74,12 @@ struct Maximum {
     log_likelihood: f64,
 }
 
+impl Maximum {
+    fn is_apart_from(&self, other: &Self) -> bool {
+        (self.offset - other.offset).abs() > APART * self.variance.min(other.variance).sqrt()
+    }
+}
+
 /// Common time of the clocks, with each one's share. Clocks that are right by definition have all
 /// of it.
 pub(super) fn common_time(clocks: &[ClockReading]) -> Common {
@@ -89,10 +95,7 @@ pub(super) fn common_time(clocks: &[ClockReading]) -> Common {
     let mut maxima: Vec<Maximum> = Vec::new();
     for &start in &order {
         let found = climb(clocks, &order, clocks[start].offset);
-        let is_new = |known: &Maximum| {
-            (known.offset - found.offset).abs() > APART * known.variance.min(found.variance).sqrt()
-        };
-        if maxima.iter().all(is_new) {
+        if maxima.iter().all(|known| known.is_apart_from(&found)) {
             maxima.push(found);
         }
     }

@@ -3,18 +3,21 @@
 use nalgebra::{DMatrix, DVector, Vector3};
 
 /// Length of a piece, s: a weave of 1 rad/s and 10 m is followed to 2 mm, its beginning and its end
-/// (steps of the acceleration) to a few centimetres. With twice as much the weave is followed to 3
-/// cm: a cubic's error grows with the fourth power.
+/// (steps of the acceleration) to a few centimetres. With half of it an adjustment has twice as
+/// many unknowns; with twice as much the weave is followed to 3 cm: a cubic's error grows with the
+/// fourth power.
 const PIECE_S: f64 = 0.5;
-/// Finite differences of neighbouring coefficients; a piece's third derivative is made of the
-/// third.
+/// Third finite difference of neighbouring coefficients, of which a piece's third derivative is
+/// made.
 const THIRD: [f64; 4] = [-1.0, 3.0, -3.0, 1.0];
+/// Second finite difference of neighbouring coefficients, for the acceleration.
 const SECOND: [f64; 3] = [1.0, -2.0, 1.0];
+/// First finite difference of neighbouring coefficients, for the velocity.
 const FIRST: [f64; 2] = [-1.0, 1.0];
-/// Nothing accelerates or flies beyond this, m/s^2 and m/s: it constrains what no bearing
-/// determines. With half of either the same: over the whole curve each counts as a single
-/// measurement.
+/// Nothing accelerates beyond this, m/s^2: it constrains what no bearing determines. With half of
+/// it the same: over the whole curve it counts as a single measurement.
 const VAGUE_ACCELERATION: f64 = 50.0;
+/// Nothing flies faster than this, m/s. With half of it the same, for the same reason.
 const VAGUE_SPEED: f64 = 300.0;
 /// Standard deviation of a coefficient about the origin, m: it constrains what nothing else does.
 /// With half of it the same: it only sets where a descent begins.
@@ -145,16 +148,25 @@ fn add_differences(information: &mut DMatrix<f64>, points: usize, difference: &[
     }
 }
 
+/// The target at a time.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct CurvePoint {
+    /// m.
+    pub(super) place: Vector3<f64>,
+    /// m/s.
+    pub(super) velocity: Vector3<f64>,
+}
+
 impl Basis {
     /// Place and velocity for the coefficients at the beginning of a vector.
-    pub(super) fn at(&self, coefficients: &DVector<f64>) -> (Vector3<f64>, Vector3<f64>) {
+    pub(super) fn at(&self, coefficients: &DVector<f64>) -> CurvePoint {
         let (mut place, mut velocity) = (Vector3::zeros(), Vector3::zeros());
         for i in 0..4 {
             let point = coefficients.fixed_rows::<3>(3 * (self.first + i));
             place += point * self.place[i];
             velocity += point * self.velocity[i];
         }
-        (place, velocity)
+        CurvePoint { place, velocity }
     }
 }
 
@@ -170,7 +182,7 @@ mod tests {
         let places = times.map(|time_s| TimedPlace { time_s, place: at(time_s) });
         let coefficients = curve.fit(places, 1e-3).unwrap();
         for t in [-1.2, -0.3, 0.77, 3.1] {
-            let (place, velocity) = curve.basis(t).at(&coefficients);
+            let CurvePoint { place, velocity } = curve.basis(t).at(&coefficients);
             assert!((place - at(t)).norm() < 1e-2, "{t}: {place}");
             assert!(
                 (velocity - Vector3::new(10.0, -2.0 * t, 0.0)).norm() < 1e-2,

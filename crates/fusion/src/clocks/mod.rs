@@ -22,11 +22,11 @@ use crossfix_message::{CameraName, ClockSource, Timestamp};
 use nalgebra::Matrix6;
 
 use self::belief::Belief;
-use self::window::{Role, StampedLine, TrackWindow};
+use self::window::{ClockRole, StampedLine, TrackWindow};
 use self::window_update::{WindowUpdate, window_update};
 use crate::config::Clocks;
 use crate::ingress::Exposure;
-use crate::track::{Track, TrackId};
+use crate::track::{FusedTrack, TrackId};
 use crate::tracker::Tracker;
 use crate::uncertainty::CameraUncertainty;
 
@@ -48,10 +48,10 @@ const SURE_S: f64 = 0.002;
 /// How often the open windows are evaluated while a clock is worse known than [`SURE_S`], s. With
 /// half of it twice as many adjustments, of milliseconds each, show a new clock half a second
 /// sooner.
-const LOOK_EVERY_S: f64 = 1.0;
+const UNSURE_CHECK_S: f64 = 1.0;
 /// How often they are evaluated when all clocks are well known, s: one may jump. With half of it
 /// that shows two seconds sooner, at twice the cost.
-const CHECK_EVERY_S: f64 = 4.0;
+const SURE_CHECK_S: f64 = 4.0;
 /// Least time between two adjustments, s: many exposures may come at once. With half of it twice as
 /// many adjustments may hold up the exposures of one moment.
 const PAUSE_S: f64 = 0.02;
@@ -127,7 +127,7 @@ pub(crate) struct ClockEstimator {
     /// What each camera reports of its clock.
     reported: BTreeMap<CameraName, Reported>,
     now: Timestamp,
-    next_look: Timestamp,
+    next_check: Timestamp,
     /// When the next window may be adjusted.
     next_adjustment: Timestamp,
     /// The pass over the open windows that is under way.
@@ -149,7 +149,7 @@ impl ClockEstimator {
             worst_sd_s: 0.0,
             reported: BTreeMap::new(),
             now: Timestamp::MIN,
-            next_look: Timestamp::MIN,
+            next_check: Timestamp::MIN,
             next_adjustment: Timestamp::MIN,
             round: None,
             needed: false,
@@ -159,7 +159,7 @@ impl ClockEstimator {
     }
 
     /// How many times what is known of the clocks may have changed: times that were corrected by an
-    /// earlier estimate are to be corrected anew.
+    /// earlier estimate are to be corrected again.
     pub(crate) fn changes(&self) -> u64 {
         self.changes
     }
@@ -273,8 +273,9 @@ impl ClockEstimator {
         if self.now < self.next_adjustment {
             return;
         }
-        let followed =
-            |id: TrackId| tracker.track(id).is_some_and(|t| t.is_confirmed() && t.is_held());
+        let followed = |id: TrackId| {
+            tracker.track(id).is_some_and(|t| t.is_confirmed() && t.is_triangulated())
+        };
         let now = self.now;
         let full = |window: &TrackWindow| now.seconds_since(window.start) >= WINDOW_S;
         if let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
@@ -286,11 +287,11 @@ impl ClockEstimator {
             self.next_adjustment = now.plus_seconds(PAUSE_S);
             return;
         }
-        if self.round.is_none() && self.now >= self.next_look {
+        if self.round.is_none() && self.now >= self.next_check {
             self.round = Some(Round::default());
         }
         if let Some(round) = self.round.take() {
-            self.look(round);
+            self.evaluate_next(round);
             self.next_adjustment = now.plus_seconds(PAUSE_S);
         }
     }
@@ -301,32 +302,25 @@ impl ClockEstimator {
         self.belief.step_time(step_s);
         self.forget_provisional();
         self.windows.clear();
-        for time in [&mut self.now, &mut self.next_look, &mut self.next_adjustment] {
+        for time in [&mut self.now, &mut self.next_check, &mut self.next_adjustment] {
             *time = time.plus_seconds(step_s);
         }
     }
 
     /// Takes in a bearing of a track, stamped by the camera's own clock.
-    pub(crate) fn update(&mut self, track: &Track, exposure: &Exposure, line: &SightLine) {
+    pub(crate) fn update(&mut self, track: &FusedTrack, exposure: &Exposure, line: &SightLine) {
         // Undo the correction: windows use the camera's own time.
         let time = exposure.time.plus_seconds(exposure.correction_s);
         let camera = &exposure.camera;
-        let index = self.windows.iter().position(|window| window.track == track.id).or_else(|| {
-            let fast = track.state().velocity().norm() >= LEAST_SPEED;
-            let worth = fast && track.is_confirmed() && track.is_held();
-            (worth && self.windows.len() < MAX_WINDOWS).then(|| {
-                self.windows.push(TrackWindow::new(track.id, time));
-                self.windows.len() - 1
-            })
-        });
-        let Some(index) = index else {
+        let known = self.windows.iter().position(|window| window.track == track.id);
+        let Some(index) = known.or_else(|| self.open_window(track, time)) else {
             return;
         };
         let is_new = !self.windows[index].cameras.contains(camera);
         let role = if is_new && self.is_to_be_estimated(camera, index) {
-            Role::Estimated
+            ClockRole::Estimated
         } else {
-            Role::Anchor
+            ClockRole::Anchor
         };
         let window = &mut self.windows[index];
         let CameraUncertainty { declared_lasting, factor, .. } = exposure.uncertainty;
@@ -334,19 +328,32 @@ impl ClockEstimator {
         window.add(camera, role, line, track.position_at(exposure.time).coords);
     }
 
+    /// Opens a window for a track that shows the clocks, if there is room for one; returns its
+    /// index.
+    fn open_window(&mut self, track: &FusedTrack, time: Timestamp) -> Option<usize> {
+        let fast = track.state().velocity().norm() >= LEAST_SPEED;
+        let worth = fast && track.is_confirmed() && track.is_triangulated();
+        (worth && self.windows.len() < MAX_WINDOWS).then(|| {
+            self.windows.push(TrackWindow::new(track.id, time));
+            self.windows.len() - 1
+        })
+    }
+
+    /// Deviation of a camera's clock relative to the others, s; 0 for a camera without an estimate.
+    fn relative_sd_s(&self, camera: &CameraName) -> f64 {
+        self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s)
+    }
+
     /// Largest relative deviation of any camera's clock, s.
     fn worst_sd(&self) -> f64 {
-        let sd = |camera| {
-            self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s)
-        };
-        self.reported.keys().map(sd).fold(0.0, f64::max)
+        self.reported.keys().map(|camera| self.relative_sd_s(camera)).fold(0.0, f64::max)
     }
 
     /// Whether a window should learn a camera's clock: it is among the worst known, and the camera
     /// is in no other window.
     fn is_to_be_estimated(&self, camera: &CameraName, index: usize) -> bool {
         let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
-        let sd = self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
+        let sd = self.relative_sd_s(camera);
         // The worst half first: a window holds few cameras.
         let is_bad = self.is_suspected(camera) || sd > SURE_S.max(self.worst_sd_s / 2.0);
         is_bad && !others().any(|(_, window)| window.cameras.contains(camera))
@@ -360,7 +367,7 @@ impl ClockEstimator {
                 self.changes += u64::from(!reported.suspected || reported.cleared);
                 (reported.suspected, reported.cleared) = (true, false);
             }
-            self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));
+            self.next_check = self.next_check.min(self.now.plus_seconds(UNSURE_CHECK_S));
             // Earlier bearings may have been stamped before the jump.
             self.windows
                 .iter_mut()
@@ -410,7 +417,7 @@ impl ClockEstimator {
     }
 
     /// Evaluates the next open window; after the last one the provisional belief takes effect.
-    fn look(&mut self, mut round: Round) {
+    fn evaluate_next(&mut self, mut round: Round) {
         if let Some(window) = self.windows.get(round.next) {
             if let WindowUpdate::Accepted(next) =
                 window_update(round.belief.as_ref().unwrap_or(&self.belief), window)
@@ -430,71 +437,10 @@ impl ClockEstimator {
         self.provisional = round.belief;
         self.changes += 1;
         // Soon again while a clock that is in use is not well known.
-        let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
-        self.next_look = self.now.plus_seconds(pause);
+        let pause = if self.is_unsure() { UNSURE_CHECK_S } else { SURE_CHECK_S };
+        self.next_check = self.now.plus_seconds(pause);
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_clock_that_is_not_estimated_is_as_good_as_each_frame_says_and_a_trusted_one_is_right() {
-        let [word, trusted, unsure] =
-            ["a", "t", "u"].map(|name| name.parse::<CameraName>().unwrap());
-        let config = Clocks { trusted: vec![trusted.clone()], ..Clocks::default() };
-        let mut clocks = ClockEstimator::new(config);
-        for (camera, sd_s) in [(&word, 0.9e-3), (&trusted, 0.3), (&unsure, 0.1)] {
-            clocks.see(camera, &CameraUncertainty::of_time(sd_s));
-        }
-        let sd_s = |clocks: &ClockEstimator, camera: &CameraName, said| {
-            clocks.time_sd_s(camera, &clocks.estimate(camera).unwrap(), said)
-        };
-        assert_eq!(sd_s(&clocks, &word, 0.9e-3), 0.9e-3);
-        assert_eq!(sd_s(&clocks, &word, 2e-3), 2e-3);
-        assert!(sd_s(&clocks, &trusted, 0.3) < 1e-5);
-        assert!((sd_s(&clocks, &unsure, 1e-4) - 0.1).abs() < 1e-3);
-        // Twice as bad is not much worse; a lost source of time is.
-        for (said, expected) in [(2e-3, 2e-3), (0.3, 0.3), (1e-3, 0.3)] {
-            clocks.see(&word, &CameraUncertainty::of_time(said));
-            assert!((sd_s(&clocks, &word, said) - expected).abs() < 0.01 * expected, "{said}");
-        }
-        assert!(clocks.is_needed());
-    }
-
-    #[test]
-    fn of_another_clock_nothing_is_known_but_what_is_said() {
-        let [late, other] = ["a", "b"].map(|name| name.parse::<CameraName>().unwrap());
-        let by = |clock_source, sd_s| CameraUncertainty {
-            clock_source,
-            ..CameraUncertainty::of_time(sd_s)
-        };
-        // The camera that is heard first is the reference of the others' offsets.
-        for late_is_first in [false, true] {
-            let mut clocks = ClockEstimator::new(Clocks::default());
-            let mut first =
-                [(&other, by(ClockSource::Ntp, 0.01)), (&late, by(ClockSource::Arrival, 0.1))];
-            if late_is_first {
-                first.reverse();
-            }
-            first.iter().for_each(|(camera, said)| clocks.see(camera, said));
-            let of = |clocks: &ClockEstimator, camera| clocks.estimate(camera).unwrap();
-            let sd_s = of(&clocks, &late).sd_s;
-            assert!((sd_s - 0.1).abs() < 0.01, "{sd_s}");
-            // The camera's own clock is good, and its offset is not that of the arrival times.
-            clocks.see(&late, &by(ClockSource::Camera, 0.02));
-            for (camera, sd_s) in [(&late, 0.02), (&other, 0.01)] {
-                let estimate = of(&clocks, camera);
-                assert!(estimate.offset_s.abs() < 1e-9, "{camera}: {estimate:?}");
-                assert!(estimate.sd_s < 1.1 * sd_s, "{camera}: {estimate:?}");
-            }
-            // The offset between the two clocks is no better known than the new clock is.
-            let apart_s = of(&clocks, &late).relative_sd_s.hypot(of(&clocks, &other).relative_sd_s);
-            assert!(apart_s > 0.01, "{apart_s}");
-            clocks.see(&late, &by(ClockSource::Arrival, 0.1));
-            let sd_s = of(&clocks, &late).sd_s;
-            assert!((sd_s - 0.1).abs() < 0.01, "{sd_s}");
-        }
-    }
-}
+mod tests;

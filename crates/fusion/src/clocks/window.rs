@@ -1,5 +1,7 @@
 //! Bearings of one track over a few seconds, stamped by the cameras' own clocks.
 
+use std::ops::Range;
+
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Vector3};
@@ -17,17 +19,18 @@ struct WindowBounds {
     /// Cameras, with eight unknowns each. The others have their turn with another window. With half
     /// of it the anchors alone may fill a window.
     cameras: usize,
-    /// Anchors ([`Role::Anchor`]) among them in the first [`ADMISSION_S`]. With twice as much they may
-    /// take all places before a camera to be estimated is heard.
+    /// Anchors ([`ClockRole::Anchor`]) among them in the first [`ADMISSION_S`]. With twice as much
+    /// they may take all places before a camera to be estimated is heard.
     anchors: usize,
     /// Time of a bearing from the window's beginning, s. With half of it the same: a window is
     /// closed after eight seconds, and no clock is off by more than two.
     span_s: f64,
 }
 
+/// See there, also for what breaks with half of each.
 const BOUNDS: WindowBounds = WindowBounds { bearings: 1500, cameras: 8, anchors: 4, span_s: 30.0 };
 /// After this all cameras to be estimated that see the target have been heard, s. With half of it
-/// an anchor may take the place of one of two frames a second.
+/// an anchor may take the place of one of two frames per second.
 const ADMISSION_S: f64 = 0.5;
 /// Least bearings of a camera: with fewer, what it says of its clock cannot be checked. With half
 /// of it two bearings, four numbers, are fitted by the eight unknowns of clock and pose.
@@ -62,7 +65,7 @@ pub(super) struct StampedLine {
 
 /// Role of a camera in a window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Role {
+pub(super) enum ClockRole {
     /// Its clock is to be learnt.
     Estimated,
     /// Its clock is known, or another window's task: the others are learnt relative to it.
@@ -105,7 +108,7 @@ impl TrackWindow {
     pub(super) fn add(
         &mut self,
         camera: &CameraName,
-        role: Role,
+        role: ClockRole,
         StampedLine { time, mut line, lasting, white }: StampedLine,
         place: Vector3<f64>,
     ) {
@@ -116,12 +119,12 @@ impl TrackWindow {
         let known = self.cameras.iter().position(|known| known == camera);
         let no_anchor = self.anchors >= BOUNDS.anchors && time_s < ADMISSION_S;
         if known.is_none()
-            && (self.cameras.len() >= BOUNDS.cameras || (role == Role::Anchor && no_anchor))
+            && (self.cameras.len() >= BOUNDS.cameras || (role == ClockRole::Anchor && no_anchor))
         {
             return;
         }
         let index = known.unwrap_or_else(|| {
-            self.anchors += usize::from(role == Role::Anchor);
+            self.anchors += usize::from(role == ClockRole::Anchor);
             self.cameras.push(camera.clone());
             self.offered.push(0);
             self.white.push(white);
@@ -160,33 +163,31 @@ impl TrackWindow {
     }
 
     /// Earliest and latest time of its bearings, s.
-    pub(super) fn span(&self) -> Option<(f64, f64)> {
+    pub(super) fn span(&self) -> Option<Range<f64>> {
         let times = || self.sights.iter().map(|sight| sight.time_s);
-        (!self.sights.is_empty()).then(|| {
-            (times().fold(f64::INFINITY, f64::min), times().fold(f64::NEG_INFINITY, f64::max))
-        })
+        let (first, last) =
+            (times().fold(f64::INFINITY, f64::min), times().fold(f64::NEG_INFINITY, f64::max));
+        (!self.sights.is_empty()).then_some(first..last)
     }
 
     /// The longest time for which a camera and another see the target together, s, where the clock
     /// of each (by index in the window) is ahead by so much.
     pub(super) fn together_s(&self, camera: usize, ahead_s: impl Fn(usize) -> f64) -> f64 {
-        let spans: Vec<(f64, f64)> = (0..self.cameras.len())
-            .map(|index| {
-                let (first, last) = self.span_of(index);
-                (first - ahead_s(index), last - ahead_s(index))
-            })
-            .collect();
-        let (first, last) = spans[camera];
-        let others = spans.iter().enumerate().filter(|(index, _)| *index != camera);
-        others.map(|(_, other)| last.min(other.1) - first.max(other.0)).fold(0.0, f64::max)
+        let span = |index: usize| {
+            let Range { start, end } = self.span_of(index);
+            start - ahead_s(index)..end - ahead_s(index)
+        };
+        let own = span(camera);
+        let others = (0..self.cameras.len()).filter(|index| *index != camera).map(span);
+        others.map(|other| own.end.min(other.end) - own.start.max(other.start)).fold(0.0, f64::max)
     }
 
     /// Earliest and latest time of a camera's bearings, s; infinite, the later one first, if it has
     /// none.
-    fn span_of(&self, camera: usize) -> (f64, f64) {
+    fn span_of(&self, camera: usize) -> Range<f64> {
         let own = self.sights.iter().filter(|sight| sight.camera == camera);
-        own.fold((f64::INFINITY, f64::NEG_INFINITY), |(first, last), sight| {
-            (first.min(sight.time_s), last.max(sight.time_s))
+        own.fold(f64::INFINITY..f64::NEG_INFINITY, |span, sight| {
+            span.start.min(sight.time_s)..span.end.max(sight.time_s)
         })
     }
 
@@ -201,9 +202,9 @@ impl TrackWindow {
         if count < 2.0 || excess <= 0.0 {
             return 1.0;
         }
-        let (first, last) = self.span_of(camera);
+        let Range { start, end } = self.span_of(camera);
         let lasting = CorrelatedNoise { sd_rad: excess.sqrt(), time_s: LASTING_S };
-        1.0 - excess + lasting.as_white((last - first) / (count - 1.0))
+        1.0 - excess + lasting.as_white((end - start) / (count - 1.0))
     }
 
     /// Indices of the cameras that have given enough bearings to be checked.
@@ -258,7 +259,7 @@ mod tests {
             let time = Timestamp::from_seconds(f64::from(k) * 1e-3);
             window.add(
                 &camera,
-                Role::Estimated,
+                ClockRole::Estimated,
                 StampedLine { time, line, lasting: CorrelatedNoise::NONE, white: 1.0 },
                 Vector3::zeros(),
             );
@@ -268,7 +269,7 @@ mod tests {
             "{}",
             window.sights.len()
         );
-        let (first, last) = window.span().unwrap();
+        let Range { start: first, end: last } = window.span().unwrap();
         assert!(first < 0.01 && last > 8.9, "{first} {last}");
         let of_b = window.sights.iter().filter(|sight| sight.camera == 1).count();
         assert!(of_b.abs_diff(window.sights.len() / 3) <= 2, "{of_b}");
@@ -281,7 +282,7 @@ mod tests {
         // Sixteen cameras, of which the last two are to be learnt, three times in half a second.
         for k in 0..60_u32 {
             let camera = format!("{:02}", k % 16).parse().unwrap();
-            let role = if k % 16 < 14 { Role::Anchor } else { Role::Estimated };
+            let role = if k % 16 < 14 { ClockRole::Anchor } else { ClockRole::Estimated };
             window.add(
                 &camera,
                 role,

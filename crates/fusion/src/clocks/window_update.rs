@@ -17,11 +17,11 @@ const LEAST_WINDOW_S: f64 = 1.0;
 /// itself. With half of it a bird that is taken for the target in one bearing of six spoils a
 /// window.
 const MAX_OUTLIERS: f64 = 0.3;
-/// Residuals larger than this, or clocks farther than this from their prior (both squared, over
-/// what was expected), may be due to a clock that has jumped. With half of the first every window
-/// is searched for jumps, in up to fifteen fits more; with half of the second a jump that only the
-/// prior shows is looked for at 0.7 times the size.
+/// Residuals larger than this (squared, over what was expected) may be due to a clock that has
+/// jumped. With half of it every window is searched for jumps, in up to fifteen fits more.
 const SUSPICIOUS_SCALE: f64 = 1.5;
+/// So may clocks farther than this from their prior (squared, over what was expected). With half of
+/// it a jump that only the prior shows is searched for at 0.7 times the size.
 const SUSPICIOUS_PULL: f64 = 6.0;
 /// By how much (twice the logarithm) a jump must make a window likelier: clocks jump once a day.
 /// With half of it a jump would be accepted as if they did every twelve minutes.
@@ -40,8 +40,8 @@ const MAX_MARGIN_S: f64 = 1.0;
 /// Longest window, s: it bounds the number of a curve's pieces. With half of it the last bearings
 /// of a full window, of 8 s and its margins, lie beyond the curve.
 const LONGEST_S: f64 = 12.0;
-/// Jerk density that is tried first, m^2/s^5, as a power of ten. Each power between it and the best
-/// one costs a descent.
+/// Jerk density that is tried first, m^2/s^5, as a power of ten: a small drone's. Each power
+/// between it and the best one costs a descent; with half of the density the best one is the same.
 const FIRST_DENSITY: i32 = 0;
 
 /// Difference of evidence (twice the logarithm) that is as good as none. With half of it more jumps
@@ -72,12 +72,11 @@ struct JumpTest<'a> {
 /// The belief after a window. If the window does not fit it well, a camera's clock may have jumped.
 pub(super) fn window_update(belief: &Belief, window: &TrackWindow) -> WindowUpdate {
     let window = window.checked();
-    let Some((_, last)) = window.span().filter(|(first, last)| last - first >= LEAST_WINDOW_S)
-    else {
+    let Some(span) = window.span().filter(|span| span.end - span.start >= LEAST_WINDOW_S) else {
         return WindowUpdate::Uninformative;
     };
     let mut belief = belief.clone();
-    let now = window.start.plus_seconds(last);
+    let now = window.start.plus_seconds(span.end);
     belief.advance(now);
     let clocks = window.cameras.iter().filter(|camera| belief.index(camera).is_some()).count();
     if clocks == 0 || window.cameras.len() < 2 {
@@ -131,8 +130,8 @@ impl JumpTest<'_> {
         // Nothing fits: try without anything learnt of clocks and poses before.
         self.belief.reset_all();
         self.components = components(&self.belief, self.window);
-        let anew = self.fit(&self.belief).filter(fits);
-        anew.map_or(WindowUpdate::Uninformative, |adjusted| {
+        let after_reset = self.fit(&self.belief).filter(fits);
+        after_reset.map_or(WindowUpdate::Uninformative, |adjusted| {
             WindowUpdate::Contradicts(Box::new(self.learnt(self.belief.clone(), &adjusted)))
         })
     }
@@ -165,10 +164,10 @@ impl JumpTest<'_> {
     /// cameras, their geometric mean.
     fn repetitions(&self, window: &TrackWindow, shown: &[&AdjustedCameras]) -> Vec<f64> {
         let found = |index: usize| shown.iter().map(move |fit| fit.inflations[index]);
-        let of_camera = |(index, known): (usize, &Option<f64>)| {
-            known.unwrap_or_else(|| found(index).fold(1.0, f64::max))
-        };
-        let factors: Vec<f64> = self.known.iter().enumerate().map(of_camera).collect();
+        let most_found = |index: usize| found(index).fold(1.0, f64::max);
+        let known = self.known.iter().enumerate();
+        let factors: Vec<f64> =
+            known.map(|(index, known)| known.unwrap_or_else(|| most_found(index))).collect();
         let logarithms = factors.iter().map(|factor| factor.ln());
         let typical = (logarithms.sum::<f64>() / factors.len() as f64).exp();
         let at_least = factors.iter().enumerate().map(|(index, factor)| {
@@ -198,8 +197,8 @@ impl JumpTest<'_> {
         if plain.is_some_and(|plain| fits(plain) && strange(plain) < SUSPICIOUS_SCALE) {
             return None;
         }
-        let (first, last) = self.window.span()?;
-        let later = self.window.without_early((first + last) / 2.0, camera);
+        let span = self.window.span()?;
+        let later = self.window.without_early((span.start + span.end) / 2.0, camera);
         if !later.checked_cameras().contains(camera) {
             return None;
         }
@@ -230,7 +229,8 @@ impl JumpTest<'_> {
         belief.widen_jumped(camera);
         let mut shown: Vec<&AdjustedCameras> = plain.into_iter().collect();
         let first = self.fit_once(&belief, window, &shown).filter(fits)?;
-        // What counts as lasting only makes a jump less sure: one that does not show yet never will.
+        // What counts as lasting only makes a jump less sure: one that does not show yet never
+        // will.
         if !self.shows_jump(camera, window, &self.learnt(belief.clone(), &first)) {
             return None;
         }

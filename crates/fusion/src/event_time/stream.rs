@@ -19,7 +19,7 @@ const LONGEST_BACKLOG_S: f64 = 30.0;
 
 /// Timing of one camera's frames.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Stream {
+pub(super) struct FrameStream {
     pub(super) newest: Timestamp,
     /// The newest time that agreed with another camera's.
     pub(super) trusted: Timestamp,
@@ -45,7 +45,7 @@ pub(super) struct Stream {
     disorder: Option<(f64, Timestamp)>,
 }
 
-impl Stream {
+impl FrameStream {
     pub(super) fn beginning(newest: Timestamp) -> Self {
         Self {
             newest,

@@ -289,7 +289,7 @@ fn where_most_clocks_come_back_from_ahead_the_order_is_taken_up_anew() {
     for cameras in [1, 2, 3, 5] {
         let mut buffer = EventBuffer::new(EventTime::default());
         let refused = run(&mut buffer, cameras, 0..40, |_, t| Some(between(5.0..7.0, t, 600.0)));
-        assert!(buffer.take_restart().is_some(), "{cameras} cameras");
+        assert!(buffer.take_rewind().is_some(), "{cameras} cameras");
         // For the 2 s that they must be behind, for which they are waited for, and a few frames.
         assert!(refused < 40 * cameras, "{cameras} cameras: {refused}");
         assert!(buffer.released > Timestamp::from_seconds(39.0), "{:?}", buffer.released);
@@ -305,7 +305,7 @@ fn what_a_network_held_back_is_late_and_not_a_clock_that_was_ahead() {
     // Four seconds of two cameras come at once.
     run(&mut buffer, 3, 5..9, |camera, t| (camera > 0).then_some(t));
     run(&mut buffer, 3, 9..20, |_, t| Some(t));
-    assert_eq!(buffer.take_restart(), None);
+    assert_eq!(buffer.take_rewind(), None);
 }
 
 /// Three cameras at 30 Hz until `until_s`; the third is silent from 10 to 20 s and says it all
@@ -330,7 +330,7 @@ fn backlog(
         for (camera, phase) in [("a", 0.0), ("b", 0.01)] {
             heard.push((camera, buffer.insert(exposure(camera, t + phase))));
         }
-        assert_eq!(buffer.take_restart(), None, "at {t} s");
+        assert_eq!(buffer.take_rewind(), None, "at {t} s");
         drain(buffer);
     }
     heard
@@ -479,7 +479,7 @@ fn a_clock_that_races_costs_nobody_else_a_frame() {
                 refused.push(t);
             }
         }
-        assert_eq!(buffer.take_restart(), None, "at {t} s");
+        assert_eq!(buffer.take_rewind(), None, "at {t} s");
         drain(&mut buffer);
     }
     assert!(refused.is_empty(), "{refused:?}");

@@ -65,7 +65,7 @@ impl Fusion {
             let sd_s = self.clocks.time_sd_s(&exposure.camera, &clock, said.sd_s);
             exposure.uncertainty.time_sd_s = sd_s;
         }
-        if let Some(by_s) = self.buffer.passed_by_s(exposure.time) {
+        if let Some(by_s) = self.buffer.behind_processed_s(exposure.time) {
             return self.refuse(exposure.refused(RejectionReason::Late { by_s }), outputs);
         }
         if self.corrected.holds(&exposure, said.time) {

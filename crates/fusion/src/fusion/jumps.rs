@@ -32,14 +32,14 @@ impl Fusion {
 
     /// Starts the order of time again at a time long passed: whatever came of times that never were
     /// is dropped.
-    pub(super) fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
+    pub(super) fn rewind(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
         self.counters.count("event_time_restarts");
         while let Some((exposure, _)) = self.corrected.pop() {
             let by_s = exposure.time.seconds_since(time);
             self.refuse(exposure.refused(RejectionReason::Future { by_s }), outputs);
         }
         self.smooth_all(outputs);
-        let changes = self.tracker.restart(time);
+        let changes = self.tracker.rewind(time);
         self.cameras.forget_clutter();
         self.emit_events(changes, time, outputs);
         self.initiator = Initiator::new(&self.config);
@@ -109,11 +109,11 @@ impl Fusion {
         self.counters.count("site_time_steps");
         self.finish(outputs);
         self.smooth_all(outputs);
-        self.buffer.begin_anew();
+        self.buffer.reset();
         self.tracker.step_time(step_s);
         self.clocks.step_time(step_s);
         self.cameras.forget_clutter();
-        self.cameras.look_anew();
+        self.cameras.reset_views();
         self.initiator = Initiator::new(&self.config);
         self.unmet = Unmet::new(&self.config.initiation);
     }

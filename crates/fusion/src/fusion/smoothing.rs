@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use crossfix_message::{Timestamp, TrackFrame};
 
 use crate::messages;
-use crate::track::{Track, TrackId};
+use crate::track::{FusedTrack, TrackId};
 use crate::tracker::Tracker;
 
 /// The waiting track frames, in the order of their times.
@@ -30,7 +30,7 @@ impl Smoothing {
     }
 
     /// Writes the smoothed states of a track that ends into the waiting frames.
-    pub(super) fn settle(&mut self, track: &Track) {
+    pub(super) fn settle(&mut self, track: &FusedTrack) {
         self.waiting
             .iter_mut()
             .for_each(|frame| fill(frame, |id| Some(track).filter(|t| t.id == id)));
@@ -38,10 +38,8 @@ impl Smoothing {
 
     /// Removes the frames that have waited long enough, and returns them with the smoothed states.
     pub(super) fn due(&mut self, now: Timestamp, tracker: &mut Tracker) -> Vec<TrackFrame> {
-        let is_due = |frame: &TrackFrame| {
-            now.seconds_since(Timestamp::from_nanos(frame.time_ns)) >= self.lag_s
-        };
-        let count = self.waiting.iter().take_while(|frame| is_due(frame)).count();
+        let times = self.waiting.iter().map(|frame| Timestamp::from_nanos(frame.time_ns));
+        let count = times.take_while(|time| now.seconds_since(*time) >= self.lag_s).count();
         self.release(count, tracker)
     }
 
@@ -63,7 +61,7 @@ impl Smoothing {
 }
 
 /// Writes the stored states of tracks into a frame.
-fn fill<'a>(frame: &mut TrackFrame, track: impl Fn(TrackId) -> Option<&'a Track>) {
+fn fill<'a>(frame: &mut TrackFrame, track: impl Fn(TrackId) -> Option<&'a FusedTrack>) {
     let time = Timestamp::from_nanos(frame.time_ns);
     for told in &mut frame.tracks {
         if let Some(state) = track(TrackId(told.id)).and_then(|track| track.remembered(time)) {

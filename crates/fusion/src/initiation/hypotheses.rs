@@ -1,6 +1,8 @@
 //! Multi-hypothesis initiation: possible targets are followed in every way that the bearings allow,
 //! until one explanation of the bearings is by far the best.
 
+mod pruning;
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_filter::Gate;
@@ -9,12 +11,12 @@ use crossfix_message::{CameraName, Solver, Timestamp};
 use super::one_target::{Mobility, OneTargetTest};
 use super::seeds::{Seed, SeedFinder};
 use super::selection::{PeriodLine, ScoredLines, Selection};
-use super::{NamedLine, Start, lines_of};
+use super::{NamedLine, NewTrack, lines_of};
 use crate::cameras::Rooted;
 use crate::cameras::{Cameras, KnownCamera};
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
-use crate::track::{StartLine, Track, TrackBearing, TrackExpectation, TrackId, TrackStatus};
+use crate::track::{FusedTrack, StartLine, TrackBearing, TrackExpectation, TrackId, TrackStatus};
 use crate::tracker::{UsedSighting, same_target};
 use crate::uncertainty::CameraUncertainty;
 use crate::visibility::log_missed;
@@ -30,17 +32,15 @@ struct HypothesisBounds {
     of_tree: usize,
     /// Hypotheses with the same lines in the newest period. With half of it the right past may be
     /// given up before later periods tell it apart.
-    alike: usize,
+    duplicates: usize,
     /// Hypotheses at a time. With half of it, in such clutter, the youngest targets go first.
     hypotheses: usize,
 }
 
+/// See there, also for what breaks with half of each.
 const BOUNDS: HypothesisBounds =
-    HypothesisBounds { branches: 3, of_tree: 100, alike: 20, hypotheses: 6_000 };
+    HypothesisBounds { branches: 3, of_tree: 100, duplicates: 20, hypotheses: 6_000 };
 
-/// A hypothesis less likely than its tree's best by this log-likelihood is given up. With half of
-/// it a wrong branch that is ahead by eight can no longer be overtaken.
-const TREE_MARGIN: f64 = 15.0;
 /// A hypothesis with a smaller log-likelihood ratio than this is clutter. A seed of two cameras may
 /// begin below zero: with half of it the first misses end a new target there.
 const LEAST_SCORE: f64 = -12.0;
@@ -54,7 +54,7 @@ struct Hypothesis {
     /// The number of its tree: all hypotheses that grew from the same seed.
     tree: u64,
     /// Boxed, as hypotheses are sorted often.
-    track: Box<Track>,
+    track: Box<FusedTrack>,
     /// Its lines of the last periods, in order of time.
     lines: Vec<PeriodLine>,
     /// Whether each camera's newest line is of something that stands in its view.
@@ -86,7 +86,7 @@ pub(super) struct Hypotheses {
     shared_lines: usize,
     hypotheses: Vec<Hypothesis>,
     /// Lines that have been used by a track which only one camera supports.
-    claims: BTreeMap<LineId, TrackId>,
+    provisional: BTreeMap<LineId, TrackId>,
     /// Numbers of periods and of trees so far.
     period: u64,
     trees: u64,
@@ -97,7 +97,7 @@ pub(super) struct Hypotheses {
 impl Hypothesis {
     /// The cameras that have given it a line in the last periods.
     fn cameras(&self) -> BTreeSet<&CameraName> {
-        self.lines.iter().map(|line| &line.id.0).collect()
+        self.lines.iter().map(|line| &line.id.camera).collect()
     }
 
     /// Whether what stands in the cameras' views explains it: but for one camera at most, whose
@@ -166,7 +166,7 @@ impl Hypotheses {
             speed: config.initiation.velocity_prior_sd_mps,
             shared_lines: config.initiation.shared_lines,
             hypotheses: Vec::new(),
-            claims: BTreeMap::new(),
+            provisional: BTreeMap::new(),
             period: 0,
             trees: 0,
             exposed: BTreeMap::new(),
@@ -174,9 +174,9 @@ impl Hypotheses {
     }
 
     /// Notes which lines of an exposure a track that only one camera supports has used.
-    pub(super) fn claim(&mut self, exposure: &Exposure, claims: &[UsedSighting]) {
-        for &UsedSighting { index, track } in claims {
-            self.claims.insert((exposure.camera.clone(), exposure.sequence, index), track);
+    pub(super) fn note_provisional(&mut self, exposure: &Exposure, used: &[UsedSighting]) {
+        for &UsedSighting { index, track } in used {
+            self.provisional.insert(LineId::new(exposure, index), track);
         }
     }
 
@@ -187,7 +187,7 @@ impl Hypotheses {
         exposures: &[&Exposure],
         cameras: &Cameras,
         motion: &MotionSetup,
-    ) -> Vec<Start> {
+    ) -> Vec<NewTrack> {
         self.period += 1;
         for exposure in exposures {
             if let Some(known) = cameras.known(&exposure.camera) {
@@ -289,7 +289,13 @@ impl Hypotheses {
         if expected {
             // ln(1 - P(visible) P_D); against one target per camera, ln(1 - P_D) alone.
             hypothesis.track.score += miss;
-            hypothesis.track.look(&exposure.camera, exposure.time, false, detection, motion);
+            hypothesis.track.note_visibility(
+                &exposure.camera,
+                exposure.time,
+                false,
+                detection,
+                motion,
+            );
             hypothesis.one_target.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
         }
         next.push(hypothesis);
@@ -311,7 +317,7 @@ impl Hypotheses {
         let density = motion.density(hypothesis.track.model_probabilities());
         hypothesis.track.measurement_update(bearing, motion)?;
         hypothesis.track.score += ratio;
-        hypothesis.track.look(&exposure.camera, exposure.time, true, detection, motion);
+        hypothesis.track.note_visibility(&exposure.camera, exposure.time, true, detection, motion);
         if let Some(TrackExpectation::Near(prediction)) = prediction {
             let mobility = Mobility { density, speed: self.speed };
             hypothesis.one_target.see(&bearing, prediction, mobility, ratio);
@@ -319,27 +325,6 @@ impl Hypotheses {
         hypothesis.lines.push(PeriodLine { period: self.period, id: id.clone() });
         hypothesis.rooted.insert(exposure.camera.clone(), exposure.sightings[index].rooted);
         Some(hypothesis)
-    }
-
-    /// Keeps the best hypotheses of each tree.
-    fn prune_trees(&mut self) {
-        self.sort();
-        let mut trees: BTreeMap<u64, (f64, usize)> = BTreeMap::new();
-        self.hypotheses.retain(|h| {
-            let (best, count) = trees.entry(h.tree).or_insert((h.track.score, 0));
-            *count += 1;
-            // Sorted by score: the first of a tree is its best.
-            *count <= BOUNDS.of_tree
-                && h.track.score > *best - TREE_MARGIN
-                && h.track.score > LEAST_SCORE
-        });
-        self.hypotheses.truncate(BOUNDS.hypotheses);
-    }
-
-    fn sort(&mut self) {
-        self.hypotheses.sort_by(|a, b| {
-            b.track.score.total_cmp(&a.track.score).then_with(|| a.lines.cmp(&b.lines))
-        });
     }
 
     /// Starts a hypothesis from every seed.
@@ -363,23 +348,16 @@ impl Hypotheses {
             // confirmed.
             let observability = Observability::unexamined(6);
             let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
-            let named = seed.lines.iter().filter_map(|((camera, ..), line)| {
+            let named = seed.lines.iter().filter_map(|(LineId { camera, .. }, line)| {
                 Some(StartLine { camera, line, uncertainty: *uncertainty.get(camera)? })
             });
-            let mut track = Box::new(Track::start(&fix, named, motion));
+            let mut track = Box::new(FusedTrack::start(&fix, named, motion));
             track.score = seed.score;
             let place = fix.state.position();
             let mut one_target = OneTargetTest::begin(&seed.lines, place, self.speed, seed.score);
             let mut rooted = BTreeMap::new();
-            for ((camera, sequence, index), timed) in &seed.lines {
-                let of = |exposure: &&&Exposure| {
-                    exposure.camera == *camera && exposure.sequence == *sequence
-                };
-                let Some(own) =
-                    exposures.iter().find(of).and_then(|exposure| exposure.sightings.get(*index))
-                else {
-                    continue;
-                };
+            for (id @ LineId { camera, .. }, timed) in &seed.lines {
+                let Some(own) = id.sighting_in(exposures) else { continue };
                 rooted.insert(camera.clone(), own.rooted);
                 let expected = uncertainty.get(camera).and_then(|uncertainty| {
                     track.expectation(timed.time, camera, timed.line.origin, uncertainty, motion)
@@ -402,22 +380,6 @@ impl Hypotheses {
         }
     }
 
-    /// Keeps the best hypotheses of those that have the same lines in this period.
-    fn prune(&mut self) {
-        self.sort();
-        let mut seen: BTreeMap<Vec<LineId>, usize> = BTreeMap::new();
-        let period = self.period;
-        self.hypotheses.retain(|h| {
-            let newest: Vec<LineId> = h.newest(period).into_iter().cloned().collect();
-            newest.is_empty() || {
-                let count = seen.entry(newest).or_default();
-                *count += 1;
-                *count <= BOUNDS.alike
-            }
-        });
-        self.hypotheses.truncate(BOUNDS.hypotheses);
-    }
-
     /// Confirms hypotheses: those of the best set without common lines that are likely enough and
     /// have no rival. The log-likelihood ratio of one target against a target per camera must reach
     /// the logarithm of the number of sets of lines that may look like one target by chance.
@@ -426,36 +388,18 @@ impl Hypotheses {
         now: Timestamp,
         lines: &BTreeMap<&CameraName, [usize; 2]>,
         motion: &MotionSetup,
-    ) -> Vec<Start> {
+    ) -> Vec<NewTrack> {
         // Sorted by score: the rest have scores of 0 and less, which are never chosen.
         let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
         let scored = likely.map(|h| ScoredLines { score: h.track.score, lines: &h.lines });
         let selection = Selection::new(scored, self.shared_lines);
-        let sure: Vec<usize> = selection
-            .chosen()
-            .filter(|&i| {
-                let hypothesis = &self.hypotheses[i];
-                // Lines of two targets, each seen by another one of two cameras, may cross for a
-                // while.
-                let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born)
-                    >= self.pair_s
-                    && hypothesis.track.is_placed();
-                let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
-                let least = hypothesis.least_one_target_ratio(lines);
-                let one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= least);
-                let likely = agreed
-                    && one
-                    && !hypothesis.stands()
-                    && hypothesis.track.score >= self.tracking.confirm_score;
-                likely && hypothesis.periods >= self.needed && {
-                    let state = hypothesis.track.predicted(now, motion);
-                    let alike = |k: usize| {
-                        same_target(&state, &self.hypotheses[k].track.predicted(now, motion))
-                    };
-                    selection.margin_of(i, alike) >= RIVAL_MARGIN
-                }
-            })
-            .collect();
+        let state = |i: usize| self.hypotheses[i].track.predicted(now, motion);
+        let likely = selection.chosen().filter(|&i| self.is_likely(&self.hypotheses[i], lines));
+        let has_no_rival = |&i: &usize| {
+            let own = state(i);
+            selection.margin_of(i, |k| same_target(&own, &state(k))) >= RIVAL_MARGIN
+        };
+        let sure: Vec<usize> = likely.filter(has_no_rival).collect();
         let lines: BTreeSet<LineId> = sure
             .iter()
             .flat_map(|&i| &self.hypotheses[i].lines)
@@ -465,21 +409,42 @@ impl Hypotheses {
         if !lines.is_empty() {
             self.hypotheses.retain(|h| h.lines.iter().all(|line| !lines.contains(&line.id)));
         }
-        if !self.claims.is_empty() {
+        if !self.provisional.is_empty() {
             let alive: BTreeSet<&LineId> =
                 self.hypotheses.iter().flat_map(|h| &h.lines).map(|line| &line.id).collect();
-            self.claims.retain(|id, _| alive.contains(id));
+            self.provisional.retain(|id, _| alive.contains(id));
         }
         starts
     }
 
-    fn start(&self, hypothesis: &Hypothesis) -> Start {
-        let mut track = Track::clone(&hypothesis.track);
+    /// Whether a hypothesis is likely enough to be confirmed if it has no rival, given the numbers
+    /// of the cameras' lines.
+    fn is_likely(
+        &self,
+        hypothesis: &Hypothesis,
+        lines: &BTreeMap<&CameraName, [usize; 2]>,
+    ) -> bool {
+        let Hypothesis { track, born, .. } = hypothesis;
+        // Lines of two targets, each seen by another one of two cameras, may cross for a while.
+        let pair_lasts = track.updated_at.seconds_since(*born) >= self.pair_s && track.is_placed();
+        let agreed = hypothesis.cameras().len() >= 3 || pair_lasts;
+        let least = hypothesis.least_one_target_ratio(lines);
+        let is_one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= least);
+        agreed
+            && is_one
+            && !hypothesis.stands()
+            && track.score >= self.tracking.confirm_score
+            && hypothesis.periods >= self.needed
+    }
+
+    fn start(&self, hypothesis: &Hypothesis) -> NewTrack {
+        let mut track = FusedTrack::clone(&hypothesis.track);
         track.status = TrackStatus::Confirmed;
         track.observe();
         let lines = hypothesis.lines.iter();
-        let claimed_by = lines.filter_map(|line| self.claims.get(&line.id)).copied().collect();
-        Start { track, cameras: hypothesis.cameras().len(), claimed_by }
+        let provisional_owners =
+            lines.filter_map(|line| self.provisional.get(&line.id)).copied().collect();
+        NewTrack { track, cameras: hypothesis.cameras().len(), provisional_owners }
     }
 }
 

@@ -1,4 +1,4 @@
-//! Initiation: new tracks from the bearings that no track claims. They are gathered into
+//! Initiation: new tracks from the bearings that no track has used. They are gathered into
 //! observation periods ([`Periods`]), and what belongs together over several periods is
 //! found either by following hypotheses ([`Hypotheses`]) or, as in Klochko 2020, by
 //! solving each period for fixes and grouping these ([`Grouped`]).
@@ -14,7 +14,7 @@ mod sight;
 
 use std::collections::BTreeSet;
 
-use crossfix_geometry::BearingModel;
+use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Vector3;
 
@@ -23,8 +23,9 @@ use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::papers::Grouped;
 use crate::spatial::{LineId, TimedLine};
-use crate::track::{Track, TrackId};
+use crate::track::{FusedTrack, TrackId};
 use crate::tracker::UsedSighting;
+use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, InitiationMethod, Sighting, SpatialSolver};
 
 pub(crate) use passing::{Passing, Passings};
@@ -43,15 +44,15 @@ pub(crate) type NamedLine = (LineId, TimedLine);
 
 /// A new track.
 #[derive(Clone, Debug)]
-pub(crate) struct Start {
-    pub(crate) track: Track,
+pub(crate) struct NewTrack {
+    pub(crate) track: FusedTrack,
     /// Number of cameras that have lately seen it.
     pub(crate) cameras: usize,
     /// The tracks, supported by one camera only, whose bearings it has used.
-    pub(crate) claimed_by: BTreeSet<TrackId>,
+    pub(crate) provisional_owners: BTreeSet<TrackId>,
 }
 
-/// Finds new targets among the bearings that no track claims.
+/// Finds new targets among the bearings that no track has used.
 #[derive(Debug)]
 pub(crate) struct Initiator {
     periods: Periods,
@@ -103,24 +104,24 @@ impl Initiator {
         used: &[UsedSighting],
         known: &KnownCamera,
         motion: &MotionSetup,
-    ) -> Vec<Start> {
+    ) -> Vec<NewTrack> {
         match self.method {
             Method::Hypotheses(_) => self.handover.see(exposure, used, known, motion),
             Method::Grouped(_) => Vec::new(),
         }
     }
 
-    /// Adds an exposure's free bearings and returns the tracks that begin with them. `claims` are
-    /// those that a track has used which only one camera supports.
+    /// Adds an exposure's free bearings and returns the tracks that begin with them. `provisional`
+    /// are those that a track has used which only one camera supports.
     pub(crate) fn add(
         &mut self,
         exposure: Exposure,
-        claims: &[UsedSighting],
+        provisional: &[UsedSighting],
         cameras: &Cameras,
         motion: &MotionSetup,
-    ) -> Vec<Start> {
+    ) -> Vec<NewTrack> {
         if let Method::Hypotheses(hypotheses) = &mut self.method {
-            hypotheses.claim(&exposure, claims);
+            hypotheses.note_provisional(&exposure, provisional);
         }
         let Some(period) = self.periods.add(exposure, cameras.len()) else {
             return Vec::new();
@@ -137,7 +138,7 @@ impl Initiator {
 /// An exposure's sight lines with their names, without the pose's uncertainty.
 pub(crate) fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     exposure.sightings.iter().take(MAX_LINES).enumerate().map(|(index, Sighting { line, .. })| {
-        let id = (exposure.camera.clone(), exposure.sequence, index);
+        let id = LineId::new(exposure, index);
         let time_sd_s = exposure.uncertainty.time_sd_s;
         (id, TimedLine { line: *line, time: exposure.time, time_sd_s, origin_sd_m: 0.0 })
     })
@@ -151,14 +152,19 @@ pub(crate) fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = Named
         // Mean over the axes, in metres: only with a range does it become an angle.
         (pose.covariance().fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt()
     });
-    lines_of(exposure).map(move |(id, mut timed)| {
-        let line = &mut timed.line;
-        let at_infinity =
-            // At infinite range only the rotation shifts the line; the position's part is
-            // `origin_sd_m`.
-            BearingModel { direction: line.direction, basis: line.basis, range: f64::INFINITY };
-        line.covariance *= exposure.uncertainty.factor;
-        line.covariance += exposure.uncertainty.shared(&at_infinity, Vector3::zeros());
-        (id, TimedLine { origin_sd_m, ..timed })
+    lines_of(exposure).map(move |(id, timed)| {
+        let line = widened_by_pose(timed.line, &exposure.uncertainty);
+        (id, TimedLine { line, origin_sd_m, ..timed })
     })
+}
+
+/// A line with the uncertainty of the pose's rotation added to its noise.
+fn widened_by_pose(mut line: SightLine, uncertainty: &CameraUncertainty) -> SightLine {
+    // At infinite range only the rotation shifts the line; the position's part is
+    // [`TimedLine::origin_sd_m`].
+    let at_infinity =
+        BearingModel { direction: line.direction, basis: line.basis, range: f64::INFINITY };
+    line.covariance *= uncertainty.factor;
+    line.covariance += uncertainty.shared(&at_infinity, Vector3::zeros());
+    line
 }

@@ -8,7 +8,7 @@ use nalgebra::Point3;
 use super::NamedLine;
 use super::sight::DirectionFilter;
 use crate::prediction::BearingPrediction;
-use crate::spatial::{TYPICAL_SPEED, TimedLine};
+use crate::spatial::{LineId, TYPICAL_SPEED, TimedLine};
 use crate::track::TrackBearing;
 use crate::visibility::independent_share;
 
@@ -56,7 +56,7 @@ impl OneTargetTest {
         speed: f64,
         log_ratio: f64,
     ) -> Self {
-        let sights = lines.iter().map(|((camera, ..), TimedLine { line, time, .. })| {
+        let sights = lines.iter().map(|(LineId { camera, .. }, TimedLine { line, time, .. })| {
             // A speed of v across the line turns it at v / r.
             let range = (place - line.origin).norm();
             (camera.clone(), DirectionFilter::first(line, *time, speed / range))

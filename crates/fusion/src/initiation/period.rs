@@ -65,7 +65,7 @@ impl Periods {
     ) -> Option<BTreeMap<CameraName, Exposure>> {
         let now = exposure.time;
         let before = self.heard.len();
-        let previous = self.hear(&exposure.camera, now);
+        let previous = self.note_exposure(&exposure.camera, now);
         self.unused.insert(exposure.camera.clone(), exposure);
         if let Some(interval_s) = self.usual_interval_s().filter(|_| previous) {
             self.heard
@@ -102,7 +102,7 @@ impl Periods {
     }
 
     /// Notes an exposure; returns whether the camera has been heard before.
-    fn hear(&mut self, camera: &CameraName, now: Timestamp) -> bool {
+    fn note_exposure(&mut self, camera: &CameraName, now: Timestamp) -> bool {
         let Some(heard) = self.heard.get_mut(camera) else {
             self.heard.insert(camera.clone(), Heard { time: now, interval_s: None });
             return false;

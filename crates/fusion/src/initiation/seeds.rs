@@ -4,7 +4,9 @@ use std::collections::BTreeSet;
 use std::f64::consts::PI;
 
 use crossfix_filter::Gate;
+use crossfix_geometry::Pose;
 use crossfix_message::Timestamp;
+use nalgebra::{Point3, Vector3};
 
 use super::passing::{Passing, Passings};
 use super::{NamedLine, lines_with_pose};
@@ -30,6 +32,7 @@ struct SeedBounds {
     kept: usize,
 }
 
+/// See there, also for what breaks with half of each.
 const BOUNDS: SeedBounds =
     SeedBounds { branches: 5, close_pairs: 20_000, found: 20_000, kept: 2_000 };
 
@@ -136,7 +139,7 @@ impl SeedFinder {
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
         let mut seeds = Vec::new();
         let mut close = 0;
-        for (a, b) in self.pairs_of_cameras(&growing) {
+        for [a, b] in self.pairs_of_cameras(&growing) {
             for i in 0..lines[a].len() {
                 for j in 0..lines[b].len() {
                     let enough = close > BOUNDS.close_pairs || seeds.len() > BOUNDS.found;
@@ -192,7 +195,7 @@ impl SeedFinder {
 
     /// Pairs of cameras within reach of each other that have lines, those whose optical axes cross
     /// most nearly at a right angle first (Klochko 2020, eq. 12).
-    fn pairs_of_cameras(&self, growing: &Growing<'_>) -> Vec<(usize, usize)> {
+    fn pairs_of_cameras(&self, growing: &Growing<'_>) -> Vec<[usize; 2]> {
         let camera = |i: usize| Some(&growing.cameras.known(&growing.exposures[i].camera)?.camera);
         let mut pairs = Vec::new();
         for a in 0..growing.exposures.len() {
@@ -204,12 +207,9 @@ impl SeedFinder {
                 let apart = (one.position() - other.position()).norm();
                 let any = !growing.lines[a].is_empty() && !growing.lines[b].is_empty();
                 if any && apart <= 2.0 * self.initiation.max_range_m {
-                    let axis = |pose: &crossfix_geometry::Pose| {
-                        pose.rotation().matrix().column(2).into_owned()
-                    };
                     // |a x b| = sin of the angle between the optical axes: the range's deviation
                     // goes with 1 / sin.
-                    pairs.push((axis(one).cross(&axis(other)).norm(), (a, b)));
+                    pairs.push((optical_axis(one).cross(&optical_axis(other)).norm(), [a, b]));
                 }
             }
         }
@@ -282,12 +282,12 @@ impl SeedFinder {
     ) -> Vec<usize> {
         let known = growing.cameras.known(&growing.exposures[c].camera);
         let newest = set.iter().map(|&at| growing.line(at).1.time).max();
-        let (Some(known), Some(reference), Some((_, first))) =
+        let (Some(known), Some(newest), Some((_, first))) =
             (known, newest, growing.lines[c].first())
         else {
             return Vec::new();
         };
-        let state = solution.state.predicted(first.time.seconds_since(reference), 0.0);
+        let state = solution.state.predicted(first.time.seconds_since(newest), 0.0);
         // Most cameras of a wide site do not look at this position.
         if !known.expects(state.position(), self.initiation.max_range_m) {
             return Vec::new();
@@ -298,11 +298,12 @@ impl SeedFinder {
         let Some(prediction) = BearingPrediction::of_state(&state, first.line.origin, moved) else {
             return Vec::new();
         };
-        let distance = |(l, (_, timed)): (usize, &NamedLine)| {
-            Some((prediction.fit(&timed.line, self.line_gate)?.gate_distance, l))
-        };
-        let mut near: Vec<(f64, usize)> =
-            growing.lines[c].iter().enumerate().filter_map(distance).collect();
+        let mut near: Vec<(f64, usize)> = Vec::new();
+        for (l, (_, timed)) in growing.lines[c].iter().enumerate() {
+            if let Some(fit) = prediction.fit(&timed.line, self.line_gate) {
+                near.push((fit.gate_distance, l));
+            }
+        }
         near.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
         near.into_iter().map(|(_, l)| l).collect()
     }
@@ -326,19 +327,26 @@ impl SeedFinder {
             return None;
         }
         // Cameras that should have seen it and have no line of it: each counts ln(1 - P_D).
-        let silent = growing.exposures.iter().enumerate().filter(|(k, exposure)| {
-            let missed = set.iter().all(|at| at.exposure != *k);
-            missed
-                && growing
-                    .cameras
-                    .known(&exposure.camera)
-                    .is_some_and(|known| known.expects(position, self.initiation.max_range_m))
-        });
+        let silent = self.silent_cameras(growing, set, position);
         let false_alarms: f64 =
             set.iter().map(|at| growing.exposures[at.exposure].clutter_per_sr.ln()).sum();
         let score = self.log_evidence(&lines, &solution)? - false_alarms
-            + silent.count() as f64 * (1.0 - self.detection_probability).ln();
+            + silent as f64 * (1.0 - self.detection_probability).ln();
         (score > self.least_score).then_some(Seed { lines, solution, score })
+    }
+
+    /// Number of cameras that should have seen a target at this position and have no line in the
+    /// set.
+    fn silent_cameras(
+        &self,
+        growing: &Growing<'_>,
+        set: &[LineIndex],
+        position: Point3<f64>,
+    ) -> usize {
+        let exposures = growing.exposures.iter().enumerate();
+        let without = exposures.filter(|(k, _)| set.iter().all(|at| at.exposure != *k));
+        let known = without.filter_map(|(_, exposure)| growing.cameras.known(&exposure.camera));
+        known.filter(|known| known.expects(position, self.initiation.max_range_m)).count()
     }
 
     /// Logarithm of the probability density of the lines if they are a new target's: the density of
@@ -376,6 +384,10 @@ fn is_rooted(growing: &Growing<'_>, set: &[LineIndex]) -> bool {
     let rooted = || set.iter().map(|&at| growing.rooted(at));
     rooted().all(|rooted| rooted == Rooted::Yes)
         || (set.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown))
+}
+
+fn optical_axis(pose: &Pose) -> Vector3<f64> {
+    pose.rotation().matrix().column(2).into_owned()
 }
 
 fn ids(seed: &Seed) -> Vec<LineId> {

@@ -96,9 +96,9 @@ impl Selection {
     }
 
     /// How much the total score falls if a chosen leaf is wrong, together with all other leaves of
-    /// its lines for which `alike` holds. 0 if the budget of comparisons is used up.
-    pub(super) fn margin_of(&self, chosen: usize, alike: impl Fn(usize) -> bool) -> f64 {
-        let others: Vec<usize> = self.neighbours(chosen).filter(|&i| !alike(i)).collect();
+    /// its lines for which `is_same` holds. 0 if the budget of comparisons is used up.
+    pub(super) fn margin_of(&self, chosen: usize, is_same: impl Fn(usize) -> bool) -> f64 {
+        let others: Vec<usize> = self.neighbours(chosen).filter(|&i| !is_same(i)).collect();
         let mut without = self.chosen.clone();
         without.remove(&chosen);
         // Without the leaf, others that clash with it may take its lines: only the difference is
@@ -207,10 +207,16 @@ impl Selection {
 
 #[cfg(test)]
 mod tests {
+    use crossfix_message::CameraName;
+
     use super::*;
 
     fn select(leaves: &[(f64, &[usize])], shared: usize) -> Selection {
-        let line = |&i: &usize| PeriodLine { period: 0, id: ("a".parse().unwrap(), 0, i) };
+        let camera: CameraName = "a".parse().unwrap();
+        let line = |&index: &usize| PeriodLine {
+            period: 0,
+            id: LineId { camera: camera.clone(), sequence: 0, index },
+        };
         let owned: Vec<(f64, Vec<PeriodLine>)> =
             leaves.iter().map(|(s, l)| (*s, l.iter().map(line).collect())).collect();
         Selection::new(owned.iter().map(|(s, l)| ScoredLines { score: *s, lines: l }), shared)

@@ -56,8 +56,8 @@ impl PastPlaces {
 #[derive(Clone, Debug)]
 pub(super) struct Theirs {
     pub(super) time: Timestamp,
-    /// The time here when it was heard.
-    pub(super) heard: Option<Timestamp>,
+    /// The time here when it was received.
+    pub(super) received: Option<Timestamp>,
     pub(super) past: PastPlaces,
     pub(super) grip: Grip,
     pub(super) born: Timestamp,
@@ -97,7 +97,7 @@ impl Ours {
         matches!(self.voice, Voice::Speaking(_))
     }
 
-    pub(super) fn is_taken(&self) -> bool {
+    pub(super) fn has_others_number(&self) -> bool {
         self.number != self.first.0
     }
 }

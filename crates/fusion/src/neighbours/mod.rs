@@ -1,5 +1,5 @@
 //! A site that is too large for one fusion centre has several, each for an area. Cameras that see
-//! into two areas are heard by both centres, so a target that flies from one area into the other
+//! into two areas are received by both centres, so a target that flies from one area into the other
 //! has for a while a track in each. This module makes them one target for everybody else: both
 //! tracks have the number of the elder, and one of the two centres says (publishes) it.
 //!
@@ -32,10 +32,10 @@ use crate::{FusionConfig, Output};
 use known::{Grip, KEPT_EVERY_S, Ours, Theirs, Voice, event, state_of};
 use likeness::{Likenesses, NeighbourTrackId, TrackPair};
 
-/// A track of which nothing has been heard for this long is no longer said, s: each is said at
+/// A track of which nothing has been received for this long is no longer said, s: each is said at
 /// least every half second. With half of it a message that is lost ends the track; with twice as
 /// much a target whose centre has died is gone for twice as long.
-const HEARD_FOR_S: f64 = 1.0;
+const RECEIVED_FOR_S: f64 = 1.0;
 /// Tracks are compared this often, s: they move little between, and each costs a pass over all.
 /// With half of it the comparisons cost twice as much and tell no more.
 const COMPARED_EVERY_S: f64 = 0.1;
@@ -82,11 +82,11 @@ struct Number(u64);
 /// let mut west = Neighbours::new(Share { index: 1, of: 2 }, &config);
 /// let seen = Track { id: 1, state: TrackState::Confirmed.into(), ..Default::default() };
 /// let frame = TrackFrame { tracks: vec![seen], ..Default::default() };
-/// let said = west.pass(vec![Output::Tracks(frame)]);
+/// let said = west.forward(vec![Output::Tracks(frame)]);
 /// let [Output::Tracks(frame)] = &said[..] else { return Err("nobody else says it".into()) };
 /// assert_eq!(frame.tracks[0].id, 2);
-/// // What the first one says is heard as it comes.
-/// west.hear(0, &TrackFrame::default());
+/// // What the first one says is received as it comes.
+/// west.receive(0, &TrackFrame::default());
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Debug)]
@@ -126,10 +126,10 @@ impl Neighbours {
     }
 
     /// Takes in what a neighbour, by its index among all centres, says of its tracks.
-    pub fn hear(&mut self, index: usize, frame: &TrackFrame) {
-        let (time, heard) = (Timestamp::from_nanos(frame.time_ns), self.now);
+    pub fn receive(&mut self, index: usize, frame: &TrackFrame) {
+        let (time, received) = (Timestamp::from_nanos(frame.time_ns), self.now);
         self.newest.insert(index, time);
-        let is_said = |track: &Theirs| time.seconds_since(track.time).abs() < HEARD_FOR_S;
+        let is_said = |track: &Theirs| time.seconds_since(track.time).abs() < RECEIVED_FOR_S;
         self.theirs.retain(|said, track| said.neighbour != index || is_said(track));
         for track in &frame.tracks {
             let said = NeighbourTrackId { neighbour: index, number: Number(track.id) };
@@ -147,7 +147,7 @@ impl Neighbours {
                 let known = self.theirs.remove(&said).map(|known| known.past);
                 let mut past = known.unwrap_or_default();
                 past.add(time, &state);
-                self.theirs.insert(said, Theirs { time, heard, past, grip, born });
+                self.theirs.insert(said, Theirs { time, received, past, grip, born });
             }
         }
     }
@@ -156,33 +156,34 @@ impl Neighbours {
     /// by the time here it has not fallen silent.
     fn is_said(&self, said: NeighbourTrackId, theirs: &Theirs) -> bool {
         let newest = self.newest.get(&said.neighbour).copied().unwrap_or(theirs.time);
-        let silent_s = match (self.now, theirs.heard) {
-            (Some(now), Some(heard)) => now.seconds_since(heard),
+        let silent_s = match (self.now, theirs.received) {
+            (Some(now), Some(received)) => now.seconds_since(received),
             _ => 0.0,
         };
-        newest.seconds_since(theirs.time) < HEARD_FOR_S && (0.0..HEARD_FOR_S).contains(&silent_s)
+        newest.seconds_since(theirs.time) < RECEIVED_FOR_S
+            && (0.0..RECEIVED_FOR_S).contains(&silent_s)
     }
 
     /// Turns what the fusion here says into what is said beside its neighbours.
-    pub fn pass(&mut self, outputs: Vec<Output>) -> Vec<Output> {
+    pub fn forward(&mut self, outputs: Vec<Output>) -> Vec<Output> {
         let mut said = Vec::with_capacity(outputs.len());
         for output in outputs {
             match output {
-                Output::Tracks(frame) => self.pass_tracks(frame, &mut said),
-                Output::Smoothed(frame) => said.extend(self.pass_smoothed(frame)),
-                Output::Event(event) => said.extend(self.pass_event(event)),
-                Output::Cues(cues) => said.push(Output::Cues(self.pass_cues(cues))),
+                Output::Tracks(frame) => self.forward_tracks(frame, &mut said),
+                Output::Smoothed(frame) => said.extend(self.forward_smoothed(frame)),
+                Output::Event(event) => said.extend(self.forward_event(event)),
+                Output::Cues(cues) => said.push(Output::Cues(self.forward_cues(cues))),
                 Output::Rejected(_) | Output::Camera(..) => said.push(output),
             }
         }
         said
     }
 
-    fn pass_tracks(&mut self, mut frame: TrackFrame, said: &mut Vec<Output>) {
+    fn forward_tracks(&mut self, mut frame: TrackFrame, said: &mut Vec<Output>) {
         let now = Timestamp::from_nanos(frame.time_ns);
         if self.now.is_none() {
-            // What was heard before there was a time here counts as heard now.
-            self.theirs.values_mut().for_each(|theirs| theirs.heard = Some(now));
+            // What was received before there was a time here counts as received now.
+            self.theirs.values_mut().for_each(|theirs| theirs.received = Some(now));
         }
         self.now = Some(now);
         let mut kept = Vec::new();
@@ -252,7 +253,7 @@ impl Neighbours {
             // far.
             let is_behind = since(theirs.time) > KEPT_EVERY_S;
             // And only once: what was compared there already tells nothing new.
-            if is_behind && theirs.heard < before {
+            if is_behind && theirs.received < before {
                 continue;
             }
             let earlier = if is_behind { past.at(theirs.time, self.density) } else { None };
@@ -282,7 +283,7 @@ impl Neighbours {
         let ours = self.ours.get(&own)?;
         let has_parted =
             |(said, _): (NeighbourTrackId, &Theirs)| self.likenesses.have_parted(own, said);
-        if ours.is_taken() && self.of_number(ours.number).any(has_parted) {
+        if ours.has_others_number() && self.of_number(ours.number).any(has_parted) {
             let ours = self.ours.get_mut(&own)?;
             ((ours.number, ours.born), ours.voice) = (ours.first, Voice::Unsaid);
             ours.untold = [TrackEventKind::Born, TrackEventKind::Confirmed]
@@ -339,7 +340,7 @@ impl Neighbours {
             Voice::Speaking(since) => {
                 // What the neighbour said before this centre began is why this one began. Where
                 // both began at once, one goes on.
-                let is_new = theirs.heard.is_some_and(|heard| heard > since);
+                let is_new = theirs.received.is_some_and(|received| received > since);
                 // A tie is decided by the centres' order, which both know alike.
                 let yields =
                     said.neighbour < self.share.index && !grip.is_better_than(&theirs.grip);
@@ -363,7 +364,7 @@ impl Neighbours {
         is_new && self.likenesses.may_be_theirs(own, now) || track.state() == TrackState::Coasting
     }
 
-    fn pass_smoothed(&self, mut frame: TrackFrame) -> Option<Output> {
+    fn forward_smoothed(&self, mut frame: TrackFrame) -> Option<Output> {
         frame.tracks.retain_mut(|track| {
             let ours = self.ours.get(&Own(track.id)).filter(|ours| ours.is_said());
             if let Some(ours) = ours {
@@ -376,7 +377,7 @@ impl Neighbours {
     }
 
     /// What happens to a track is said by the centre that says the track.
-    fn pass_event(&mut self, event: TrackEvent) -> Option<Output> {
+    fn forward_event(&mut self, event: TrackEvent) -> Option<Output> {
         let (own, now) = (Own(event.track_id), Timestamp::from_nanos(event.time_ns));
         let kind = event.kind();
         let number = self.ours(own, now).number;
@@ -408,7 +409,7 @@ impl Neighbours {
         Some(Output::Event(TrackEvent { track_id: number.0, other_id, ..event }))
     }
 
-    fn pass_cues(&self, mut frame: CueFrame) -> CueFrame {
+    fn forward_cues(&self, mut frame: CueFrame) -> CueFrame {
         for of in frame.cues.iter_mut().filter_map(|cue| cue.of.as_mut()) {
             if let Some(ours) = self.ours.get(&Own(of.track_id)) {
                 of.track_id = ours.number.0;
@@ -419,7 +420,7 @@ impl Neighbours {
 
     /// Forgets what has ended.
     fn forget(&mut self, now: Timestamp) {
-        let kept_s = HEARD_FOR_S + self.smoothing_s;
+        let kept_s = RECEIVED_FOR_S + self.smoothing_s;
         let is_kept = |ended: Timestamp| (0.0..kept_s).contains(&now.seconds_since(ended));
         self.ours.retain(|_, ours| ours.ended.is_none_or(is_kept));
         self.likenesses.forget(now);

@@ -44,10 +44,10 @@ fn exchange(
         });
         frames.collect::<Vec<_>>()
     };
-    let by_west = tracks(&west.pass(vec![Output::Tracks(frame(seconds, of_west))]));
-    by_west.iter().for_each(|frame| east.hear(0, frame));
-    let by_east = tracks(&east.pass(vec![Output::Tracks(frame(seconds + 0.01, of_east))]));
-    by_east.iter().for_each(|frame| west.hear(1, frame));
+    let by_west = tracks(&west.forward(vec![Output::Tracks(frame(seconds, of_west))]));
+    by_west.iter().for_each(|frame| east.receive(0, frame));
+    let by_east = tracks(&east.forward(vec![Output::Tracks(frame(seconds + 0.01, of_east))]));
+    by_east.iter().for_each(|frame| west.receive(1, frame));
     [by_west, by_east].map(|frames| frames.into_iter().flat_map(|frame| frame.tracks).collect())
 }
 
@@ -160,8 +160,10 @@ fn the_elder_number_wins_whoever_has_the_better_view() {
         // East's is a second older; each has been said before the other is heard.
         let [west, east] = &mut centres;
         if step >= 10 {
-            let outputs = west
-                .pass(vec![Output::Tracks(frame(seconds, vec![said(5, x, 0.0, 0.5, Confirmed)]))]);
+            let outputs = west.forward(vec![Output::Tracks(frame(
+                seconds,
+                vec![said(5, x, 0.0, 0.5, Confirmed)],
+            ))]);
             for output in &outputs {
                 match output {
                     Output::Event(event) => {
@@ -171,20 +173,20 @@ fn the_elder_number_wins_whoever_has_the_better_view() {
                         let ended = said.tracks.iter().filter(|track| track.state() == Lost);
                         lost.extend(ended.map(|track| track.id));
                         if step >= 12 {
-                            east.hear(0, said);
+                            east.receive(0, said);
                         }
                     }
                     _ => {}
                 }
             }
         }
-        let by_east =
-            east.pass(vec![Output::Tracks(frame(seconds, vec![said(9, x, 0.3, 0.5, Confirmed)]))]);
+        let by_east = east
+            .forward(vec![Output::Tracks(frame(seconds, vec![said(9, x, 0.3, 0.5, Confirmed)]))]);
         for output in by_east {
             if let Output::Tracks(said) = output
                 && step >= 12
             {
-                west.hear(1, &said);
+                west.receive(1, &said);
             }
         }
     }
@@ -205,13 +207,13 @@ fn what_a_neighbour_says_goes_over_the_wire_and_may_be_anything() {
         Track { covariance: vec![-1.0; 36], ..said(4, 0.0, 0.0, 1.0, Coasting) },
     ];
     let bytes = frame(0.0, strange.into()).encode();
-    west.hear(1, &decode(&bytes).unwrap());
+    west.receive(1, &decode(&bytes).unwrap());
     let own = vec![said(1, 0.0, 0.0, 1.0, Confirmed)];
     let mut seen = Vec::new();
     for step in 0..30 {
         let at = frame(f64::from(step) * 0.1, own.clone());
-        seen = west.pass(vec![Output::Tracks(at)]);
-        west.hear(1, &decode(&bytes).unwrap());
+        seen = west.forward(vec![Output::Tracks(at)]);
+        west.receive(1, &decode(&bytes).unwrap());
     }
     assert!(matches!(&seen[..], [Output::Tracks(frame)] if frame.tracks[0].id == 1));
 }
@@ -225,12 +227,12 @@ fn exchange_all(
 ) -> Vec<Vec<Track>> {
     let mut all = Vec::new();
     for (index, tracks) in tracks.iter().enumerate() {
-        let outputs = centres[index].pass(vec![Output::Tracks(frame(seconds, tracks.clone()))]);
+        let outputs = centres[index].forward(vec![Output::Tracks(frame(seconds, tracks.clone()))]);
         let mut said = Vec::new();
         for output in outputs {
             if let Output::Tracks(frame) = output {
                 let others = (0..centres.len()).filter(|other| *other != index);
-                others.for_each(|other| centres[other].hear(index, &frame));
+                others.for_each(|other| centres[other].receive(index, &frame));
                 said.extend(frame.tracks);
             }
         }
@@ -305,16 +307,16 @@ fn centres_whose_times_are_apart_know_their_targets_all_the_same() {
             let [west, east] = &mut centres;
             let tracks = |seconds: f64| vec![said(1, 10.0 * seconds, 0.3, 0.5, Confirmed)];
             heard.clear();
-            for output in west.pass(vec![Output::Tracks(frame(seconds, tracks(seconds)))]) {
+            for output in west.forward(vec![Output::Tracks(frame(seconds, tracks(seconds)))]) {
                 if let Output::Tracks(frame) = output {
-                    east.hear(0, &frame);
+                    east.receive(0, &frame);
                     heard.extend(frame.tracks.iter().map(|track| track.id));
                 }
             }
             let late_s = seconds - behind_s;
-            for output in east.pass(vec![Output::Tracks(frame(late_s, tracks(late_s)))]) {
+            for output in east.forward(vec![Output::Tracks(frame(late_s, tracks(late_s)))]) {
                 if let Output::Tracks(frame) = output {
-                    west.hear(1, &frame);
+                    west.receive(1, &frame);
                     heard.extend(frame.tracks.iter().map(|track| track.id));
                 }
             }
@@ -330,11 +332,11 @@ fn who_says_anothers_number_elsewhere_silences_nobody() {
     for step in 0..60 {
         let seconds = f64::from(step) * 0.1;
         let own = vec![said_at(step, 0.0, Confirmed)];
-        let outputs = west.pass(vec![Output::Tracks(frame(seconds, own))]);
+        let outputs = west.forward(vec![Output::Tracks(frame(seconds, own))]);
         let is_said = matches!(&outputs[..], [Output::Tracks(frame)] if frame.tracks[0].id == 2);
         assert!(is_said, "at {seconds} s: {outputs:?}");
         // Said by somebody whose list of areas is another, 500 m away.
-        west.hear(0, &frame(seconds, vec![said(2, f64::from(step), 500.0, 0.1, Confirmed)]));
+        west.receive(0, &frame(seconds, vec![said(2, f64::from(step), 500.0, 0.1, Confirmed)]));
     }
 }
 
@@ -345,11 +347,11 @@ fn time_that_goes_back_leaves_nothing_behind() {
         for step in 0..30 {
             let seconds = f64::from(step) * 0.1 - f64::from(round) * 100.0;
             let tracks = vec![said(round as u64 + 1, f64::from(step), 0.0, 1.0, Confirmed)];
-            west.pass(vec![Output::Tracks(frame(seconds, tracks))]);
+            west.forward(vec![Output::Tracks(frame(seconds, tracks))]);
         }
         // As where event time starts again: an event, and no frame.
         let lost = event(TrackEventKind::Lost, west.now.unwrap(), [round as u64 + 1, 0]);
-        assert_eq!(west.pass(vec![Output::Event(lost)]).len(), 1, "it is said");
+        assert_eq!(west.forward(vec![Output::Event(lost)]).len(), 1, "it is said");
     }
     assert!(west.ours.len() <= 2, "{}", west.ours.len());
 }

@@ -32,22 +32,11 @@ pub fn triple_range_covariance(alpha: f64, beta: f64, equation_sd: f64) -> Optio
     let (square_a, square_b) = (sin_a * sin_a, sin_b * sin_b);
     let sum = square_a + square_b;
     let both = cos_a * cos_b;
-    (sum > f64::EPSILON).then(|| {
-        // (A'A)^-1, where A has the rows r1 a1 - rk ak (k = 2, 3): A'A = [2 -cos a -cos b;
-        // -cos a 1 0; -cos b 0 1], with `sum` as its determinant.
-        let shape = Matrix3::new(
-            1.0,
-            cos_a,
-            cos_b,
-            cos_a,
-            1.0 + square_b,
-            both,
-            cos_b,
-            both,
-            1.0 + square_a,
-        );
-        shape * equation_sd.powi(2) / sum
-    })
+    // The adjugate of A'A, where A has the rows r1 a1 - rk ak (k = 2, 3): A'A = [2 -cos a -cos b;
+    // -cos a 1 0; -cos b 0 1], with `sum` as its determinant.
+    let (to_a, to_b) = ([cos_a, 1.0 + square_b, both], [cos_b, both, 1.0 + square_a]);
+    let adjugate = Matrix3::from_row_slice([[1.0, cos_a, cos_b], to_a, to_b].as_flattened());
+    (sum > f64::EPSILON).then(|| adjugate * equation_sd.powi(2) / sum)
 }
 
 #[cfg(test)]

@@ -20,14 +20,25 @@ pub enum Displacement {
     },
 }
 
+/// A vector of unknowns of the motion.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct MotionTerm {
+    /// Its scale per axis: a prior standard deviation.
+    pub(crate) scale: f64,
+    /// The factor by which it moves the target.
+    pub(crate) factor: f64,
+}
+
 impl Displacement {
-    /// The scale of each vector of unknowns, with the factor by which it moves the target in `dt`.
-    pub(crate) fn terms(self, dt: f64) -> Vec<(f64, f64)> {
+    /// Each vector of unknowns, with how it moves the target in `dt` seconds.
+    pub(crate) fn terms(self, dt: f64) -> Vec<MotionTerm> {
+        let by_velocity = |scale| MotionTerm { scale, factor: dt };
         match self {
-            Self::Velocity { velocity_scale } => vec![(velocity_scale, dt)],
-            Self::Acceleration { velocity_scale, acceleration_scale } => {
-                vec![(velocity_scale, dt), (acceleration_scale, dt * dt / 2.0)]
-            }
+            Self::Velocity { velocity_scale } => vec![by_velocity(velocity_scale)],
+            Self::Acceleration { velocity_scale, acceleration_scale } => vec![
+                by_velocity(velocity_scale),
+                MotionTerm { scale: acceleration_scale, factor: dt * dt / 2.0 },
+            ],
         }
     }
 

@@ -5,10 +5,10 @@ use std::collections::BTreeSet;
 use super::fixes::{FixFinder, SPEED_SIGMAS};
 use super::grouping::{Group, Grouping, GroupingRules, TemporalGate};
 use crate::cameras::Cameras;
-use crate::initiation::{NamedLine, Start};
+use crate::initiation::{NamedLine, NewTrack};
 use crate::motion::MotionSetup;
-use crate::spatial::{Fix, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
-use crate::track::{StartLine, Track, TrackBearing};
+use crate::spatial::{Fix, LineId, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
+use crate::track::{FusedTrack, StartLine, TrackBearing};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig};
 
@@ -45,29 +45,29 @@ impl Grouped {
         exposures: &[&Exposure],
         cameras: &Cameras,
         motion: &MotionSetup,
-    ) -> Vec<Start> {
+    ) -> Vec<NewTrack> {
         let groups = self.grouping.advance(&self.finder.fixes(exposures, cameras));
         let tracks = groups.iter().filter_map(|group| start(group, motion));
         tracks
-            .map(|track| Start {
+            .map(|track| NewTrack {
                 cameras: track.residuals.len(),
                 track,
-                claimed_by: BTreeSet::new(),
+                provisional_owners: BTreeSet::new(),
             })
             .collect()
     }
 }
 
 /// A tentative track: started from a group's first fix, updated with the lines of the later ones.
-fn start(group: &Group, motion: &MotionSetup) -> Option<Track> {
+fn start(group: &Group, motion: &MotionSetup) -> Option<FusedTrack> {
     let (fix, later) = starting_point(group)?;
     let vague = Fix { state: vague_velocity(fix), ..fix.clone() };
     let uncertainty = CameraUncertainty::of_time(0.0);
     let first = group.fixes.first()?;
     let named = first.lines.iter();
-    let named = named.map(|((camera, ..), line)| StartLine { camera, line, uncertainty });
-    let mut track = Track::start(&vague, named, motion);
-    for ((camera, ..), timed) in later {
+    let named = named.map(|(LineId { camera, .. }, line)| StartLine { camera, line, uncertainty });
+    let mut track = FusedTrack::start(&vague, named, motion);
+    for (LineId { camera, .. }, timed) in later {
         let (time, line) = (timed.time, &timed.line);
         let bearing = TrackBearing { camera, time, line, uncertainty: &uncertainty };
         track.measurement_update(bearing, motion)?;

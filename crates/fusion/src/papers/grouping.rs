@@ -100,9 +100,8 @@ impl Group {
 
     /// Least-squares line of the positions over time, at the time of the last.
     fn fitted_line(&self) -> Option<(Point3<f64>, Vector3<f64>)> {
-        let reference = self.last().fix.time;
-        let times: Vec<f64> =
-            self.fixes.iter().map(|f| f.fix.time.seconds_since(reference)).collect();
+        let newest = self.last().fix.time;
+        let times: Vec<f64> = self.fixes.iter().map(|f| f.fix.time.seconds_since(newest)).collect();
         let count = times.len() as f64;
         let mean_time = times.iter().sum::<f64>() / count;
         let positions = || self.fixes.iter().map(|f| f.fix.state.position().coords);
@@ -131,9 +130,18 @@ impl Group {
 struct CandidateGroup {
     fixes: usize,
     indicator: f64,
-    /// Its origin: 0 an old group, 1 an old group with one fix more, 2 a new one; then the index of
-    /// the group, and that of the fix.
-    from: (u8, usize, usize),
+    from: GroupOrigin,
+}
+
+/// What a group of a period is made of, by indices; of equally good ones the earlier is better.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum GroupOrigin {
+    /// A group of the periods before, as it was.
+    Old { group: usize },
+    /// Such a group with one fix more.
+    Longer { group: usize, fix: usize },
+    /// One fix alone.
+    New { fix: usize },
 }
 
 /// Keeps the best candidates, those with the most fixes first, then those with the least
@@ -177,14 +185,14 @@ impl Grouping {
             candidates.push(CandidateGroup {
                 fixes: group.fixes.len(),
                 indicator: group.indicator,
-                from: (0, index, 0),
+                from: GroupOrigin::Old { group: index },
             });
             for (place, fix) in fixes.iter().enumerate() {
                 if let Some(residual) = self.residual(group, fix) {
                     candidates.push(CandidateGroup {
                         fixes: group.fixes.len() + 1,
                         indicator: group.indicator + residual,
-                        from: (1, index, place),
+                        from: GroupOrigin::Longer { group: index, fix: place },
                     });
                 }
             }
@@ -193,24 +201,26 @@ impl Grouping {
                 keep_best(&mut candidates);
             }
         }
-        let begin = |place| CandidateGroup { fixes: 1, indicator: 0.0, from: (2, 0, place) };
-        candidates.extend((0..fixes.len()).map(begin));
+        let new = (0..fixes.len()).map(|fix| GroupOrigin::New { fix });
+        candidates.extend(new.map(|from| CandidateGroup { fixes: 1, indicator: 0.0, from }));
         keep_best(&mut candidates);
-        let grown = candidates.into_iter().map(|candidate| match candidate.from {
-            (0, index, _) => self.groups[index].clone(),
-            (1, index, place) => {
-                let mut longer = self.groups[index].clone();
-                longer.fixes.push(fixes[place].clone());
+        self.groups = candidates.into_iter().map(|candidate| self.made(candidate, fixes)).collect();
+    }
+
+    /// The group of a candidate.
+    fn made(&self, candidate: CandidateGroup, fixes: &[PeriodFix]) -> Group {
+        match candidate.from {
+            GroupOrigin::Old { group } => self.groups[group].clone(),
+            GroupOrigin::Longer { group, fix } => {
+                let mut longer = self.groups[group].clone();
+                longer.fixes.push(fixes[fix].clone());
                 longer.indicator = candidate.indicator;
                 longer
             }
-            (_, _, place) => Group {
-                fixes: vec![fixes[place].clone()],
-                indicator: 0.0,
-                first_period: self.period,
-            },
-        });
-        self.groups = grown.collect();
+            GroupOrigin::New { fix } => {
+                Group { fixes: vec![fixes[fix].clone()], indicator: 0.0, first_period: self.period }
+            }
+        }
     }
 
     /// The residual of a fix from a group's extrapolation, if it passes the gate.
@@ -285,7 +295,7 @@ mod tests {
                 Point3::new(x, 0.0, 0.0),
                 period as f64,
             );
-            ((camera.parse().unwrap(), period, line), timed)
+            (LineId { camera: camera.parse().unwrap(), sequence: period, index: line }, timed)
         };
         PeriodFix {
             fix: Fix {
@@ -389,7 +399,7 @@ mod tests {
         let of = |lines: [usize; 2], period: u64, x: f64| {
             let mut made = fix(period, x, 0, VelocityKnowledge::Solved);
             for (line, number) in made.lines.iter_mut().zip(lines) {
-                line.0.2 = number;
+                line.0.index = number;
             }
             made
         };

@@ -1,7 +1,7 @@
 use faer::{Col, Mat};
 use nalgebra::{Unit, Vector3};
 
-use super::displacement::displacement;
+use super::displacement::{MotionTerm, displacement};
 use super::pair::typical_range;
 use super::{Displacement, RangeSolution, pair};
 use crate::spatial::{Observability, TimedLine, WeakAxis, determined};
@@ -31,7 +31,7 @@ pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSo
     let range = typical_range(first, &others.iter().collect::<Vec<_>>());
     // Prior scales of the unknowns: the n ranges, then three axes of each term of the motion.
     let scales: Vec<f64> = std::iter::repeat_n(range, n)
-        .chain(motion.terms(0.0).into_iter().flat_map(|(scale, _)| [scale; 3]))
+        .chain(motion.terms(0.0).into_iter().flat_map(|term| [term.scale; 3]))
         .collect();
     let (a, b) = system(first, others, motion, &scales);
     let svd = a.thin_svd().ok()?;
@@ -95,7 +95,7 @@ fn system(
             let row = 3 * k + axis;
             a[(row, 0)] = first.line.direction[axis] * scales[0];
             a[(row, k + 1)] = -other.line.direction[axis] * scales[k + 1];
-            for (term, (scale, factor)) in motion.terms(dt).into_iter().enumerate() {
+            for (term, MotionTerm { scale, factor }) in motion.terms(dt).into_iter().enumerate() {
                 a[(row, n + 3 * term + axis)] = factor * scale;
             }
             b[row] = baseline[axis];

@@ -13,33 +13,35 @@ const SETTLED: f64 = 1e-5;
 /// Maximum a posteriori solution for position and velocity.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MapSolution {
-    /// The state at the reference time, with its posterior covariance.
+    /// The state at its own time, with its posterior covariance.
     pub state: KinematicState,
     /// Sum of squared normalised residuals, the prior's included: chi-square with
     /// `2 n - 3` degrees of freedom for n true lines.
     pub chi_square: f64,
-    /// Fisher information of the lines alone, and the scales that it is compared with, m and m/s.
+    /// Fisher information of the lines alone, and the scales that it is compared with.
     information: Matrix6<f64>,
-    scales: (f64, f64),
+    position_scale_m: f64,
+    velocity_scale_mps: f64,
 }
 
 impl MapSolution {
     /// Observability by the lines alone, against the prior scales: the farthest line's length and
     /// the velocity prior. Not computed with the solution, as eigenvalues cost more than that.
     pub fn observability(&self) -> Observability {
-        Observability::of_information(&self.information, self.scales.0, self.scales.1)
+        let Self { information, position_scale_m, velocity_scale_mps, .. } = self;
+        Observability::of_information(information, *position_scale_m, *velocity_scale_mps)
     }
 }
 
 /// The weighted solution for any number of lines at any times: position and velocity at
-/// `reference`, with a zero-mean prior of `velocity_sd` (m/s per axis) on the velocity.
+/// `state_time`, with a zero-mean prior of `velocity_sd` (m/s per axis) on the velocity.
 ///
 /// Where the papers' system is regular this is its solution, with each line weighted by its
 /// information; where it is not, the prior stands in for what cannot be observed. `None` for fewer
 /// than two lines, or if they do not meet in front of the cameras.
 pub fn map(
     lines: &[TimedLine],
-    reference: crossfix_message::Timestamp,
+    state_time: crossfix_message::Timestamp,
     velocity_sd: f64,
 ) -> Option<MapSolution> {
     if lines.len() < 2 {
@@ -53,7 +55,7 @@ pub fn map(
     let mut information = Matrix6::zeros();
     let mut chi_square = 0.0;
     for _ in 0..ITERATIONS {
-        let equations = NormalEquations::of(lines, reference, velocity_sd, state.as_ref())?;
+        let equations = LineNormalEquations::of(lines, state_time, velocity_sd, state.as_ref())?;
         information = equations.information;
         if let Some(x) = &state {
             chi_square = equations.squares + (x.transpose() * prior * x).x;
@@ -73,7 +75,7 @@ pub fn map(
         .iter()
         .map(|l| (l.line.origin.coords - mean.fixed_rows::<3>(0)).norm())
         .fold(0.0, f64::max);
-    in_front(lines, reference, &mean).then_some(())?;
+    in_front(lines, state_time, &mean).then_some(())?;
     // Rounding leaves the inverse of a nearly singular system not quite symmetric.
     let inverse = (information + prior).cholesky()?.inverse();
     let covariance = (inverse + inverse.transpose()) / 2.0;
@@ -81,12 +83,13 @@ pub fn map(
         state: KinematicState { mean, covariance },
         chi_square,
         information,
-        scales: (scale, velocity_sd),
+        position_scale_m: scale,
+        velocity_scale_mps: velocity_sd,
     })
 }
 
 /// The normal equations of lines at a state, with their residuals there.
-struct NormalEquations {
+struct LineNormalEquations {
     /// Sums of H' W H and of H' W z.
     information: Matrix6<f64>,
     right: Vector6<f64>,
@@ -96,11 +99,12 @@ struct NormalEquations {
     nearest: f64,
 }
 
-impl NormalEquations {
-    /// At a state at `reference`; without one all lines are weighted as if they had the same range.
+impl LineNormalEquations {
+    /// At a state at `state_time`; without one all lines are weighted as if they had the same
+    /// range.
     fn of(
         lines: &[TimedLine],
-        reference: crossfix_message::Timestamp,
+        state_time: crossfix_message::Timestamp,
         velocity_sd: f64,
         state: Option<&Vector6<f64>>,
     ) -> Option<Self> {
@@ -111,13 +115,12 @@ impl NormalEquations {
             nearest: f64::INFINITY,
         };
         for timed @ TimedLine { line, time, .. } in lines {
-            let dt = time.seconds_since(reference);
-            let offset = |x: &Vector6<f64>| {
-                Point3::from(x.fixed_rows::<3>(0) + x.fixed_rows::<3>(3) * dt) - line.origin
-            };
+            let dt = time.seconds_since(state_time);
             // A state behind the camera counts as just in front of it here, and is refused at the
             // end.
-            let range = state.map_or(1.0, |x| offset(x).dot(&line.direction).max(1e-3));
+            let range = state.map_or(1.0, |x| {
+                (position_after(x, dt) - line.origin).dot(&line.direction).max(1e-3)
+            });
             sums.nearest = sums.nearest.min(range);
             // With the tangents E, H x = z is linear in the state: E' (p + v dt - c) / range = 0.
             let tangents = line.basis.transpose() / range;
@@ -139,15 +142,20 @@ impl NormalEquations {
     }
 }
 
-/// Whether a state at `reference` lies in front of every line's camera at the line's time.
+/// The position of a state of position and velocity after `dt` seconds.
+fn position_after(mean: &Vector6<f64>, dt: f64) -> Point3<f64> {
+    Point3::from(mean.fixed_rows::<3>(0) + mean.fixed_rows::<3>(3) * dt)
+}
+
+/// Whether a state at `state_time` lies in front of every line's camera at the line's time.
 fn in_front(
     lines: &[TimedLine],
-    reference: crossfix_message::Timestamp,
+    state_time: crossfix_message::Timestamp,
     mean: &Vector6<f64>,
 ) -> bool {
     lines.iter().all(|TimedLine { line, time, .. }| {
-        let dt = time.seconds_since(reference);
-        let position = Point3::from(mean.fixed_rows::<3>(0) + mean.fixed_rows::<3>(3) * dt);
+        let dt = time.seconds_since(state_time);
+        let position = position_after(mean, dt);
         (position - line.origin).dot(&line.direction) > 0.0
     })
 }

@@ -13,6 +13,8 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Matrix2;
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
+use crate::{Exposure, Sighting};
+
 pub use map::{MapSolution, map};
 pub(crate) use observability::determined;
 pub use observability::{Observability, Quantity, WeakAxis};
@@ -47,8 +49,32 @@ impl TimedLine {
     }
 }
 
-/// Identity of a sight line: camera, sequence number of the frame, index in the frame.
-pub type LineId = (CameraName, u64, usize);
+/// Identity of a sight line.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct LineId {
+    /// The line's camera.
+    pub camera: CameraName,
+    /// Sequence number of the camera's frame.
+    pub sequence: u64,
+    /// Index among the frame's lines.
+    pub index: usize,
+}
+
+impl LineId {
+    /// Of an exposure's line.
+    pub(crate) fn new(exposure: &Exposure, index: usize) -> Self {
+        Self { camera: exposure.camera.clone(), sequence: exposure.sequence, index }
+    }
+
+    pub(crate) fn is_of(&self, exposure: &Exposure) -> bool {
+        self.camera == exposure.camera && self.sequence == exposure.sequence
+    }
+
+    /// The line's sighting, if its exposure is among these.
+    pub(crate) fn sighting_in<'a>(&self, exposures: &[&'a Exposure]) -> Option<&'a Sighting> {
+        exposures.iter().find(|exposure| self.is_of(exposure))?.sightings.get(self.index)
+    }
+}
 
 /// Solution of one period: where something was, and how fast.
 #[derive(Clone, Debug, PartialEq)]

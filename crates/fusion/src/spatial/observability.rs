@@ -130,18 +130,21 @@ impl Observability {
         // The singular values of the scaled and whitened system, whose noise is 1.
         let singular = |eigenvalue: &f64| eigenvalue.max(0.0).sqrt();
         let values: Vec<f64> = scaled.symmetric_eigenvalues().iter().map(singular).collect();
-        Self::of_singular_values(&values, 1.0, |_| {
-            // The vectors cost as much again, and a good track never asks for them.
-            let eigen = scaled.symmetric_eigen();
-            let combination = eigen.eigenvectors.column(eigen.eigenvalues.imin());
-            let of_state = [(Quantity::Position, 0), (Quantity::Velocity, 3)];
-            let parts = of_state.map(|(quantity, row)| Part {
-                quantity,
-                vector: combination.fixed_rows::<3>(row).into_owned(),
-            });
-            WeakAxis::of_parts(&parts)
-        })
+        // The vectors cost as much again, and a good track never asks for them.
+        Self::of_singular_values(&values, 1.0, |_| least_known(&scaled))
     }
+}
+
+/// The combination of position and velocity of which an information matrix says least.
+fn least_known(information: &Matrix6<f64>) -> Option<WeakAxis> {
+    let eigen = information.symmetric_eigen();
+    let combination = eigen.eigenvectors.column(eigen.eigenvalues.imin());
+    let of_state = [(Quantity::Position, 0), (Quantity::Velocity, 3)];
+    let parts = of_state.map(|(quantity, row)| Part {
+        quantity,
+        vector: combination.fixed_rows::<3>(row).into_owned(),
+    });
+    WeakAxis::of_parts(&parts)
 }
 
 /// Whether the data determine the direction of a singular value.

@@ -5,11 +5,11 @@ use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Point3;
 
-use super::{Track, log_range_sd};
+use super::{FusedTrack, log_range_sd};
 use crate::motion::MotionSetup;
 use crate::prediction::{BearingFit, BearingPrediction};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
-use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
+use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, bearing_update};
 
 /// The predicted bearing of a track for one camera.
 // Made and used in one exposure: never stored, so the size of the larger variant costs nothing.
@@ -38,11 +38,11 @@ impl TrackExpectation {
         match self {
             Self::Near(prediction) => prediction.fit(line, gate),
             Self::Along { state, seen_from, camera, errors } => {
-                let fit = |errors: &SharedErrors| {
-                    fit_along(state, *seen_from, &Measured { line, camera, errors }, gate)
-                };
-                let Some((anew, probability)) = errors.renewed() else { return fit(errors) };
-                BearingFit::likelier(fit(errors), fit(&anew), probability)
+                let known = fit_along(state, *seen_from, &Measured { line, camera, errors }, gate);
+                let Some((drawn_again, probability)) = errors.renewed() else { return known };
+                let measured = Measured { line, camera, errors: &drawn_again };
+                let renewed = fit_along(state, *seen_from, &measured, gate);
+                BearingFit::likelier(known, renewed, probability)
             }
         }
     }
@@ -56,12 +56,12 @@ fn fit_along(
     measured: &Measured<'_>,
     gate: Gate,
 ) -> Option<BearingFit> {
-    let Updated { nis, log_likelihood, .. } = updated(state, Some(seen_from), measured)?;
+    let Updated { nis, log_likelihood, .. } = bearing_update(state, Some(seen_from), measured)?;
     let fit = BearingFit { gate_distance: nis, log_density: log_likelihood };
     gate.holds(nis).then_some(fit)
 }
 
-impl Track {
+impl FusedTrack {
     /// The predicted bearing at a time for a camera at `origin`; `None` if the target would be at
     /// the camera itself.
     pub(crate) fn expectation(
@@ -72,7 +72,7 @@ impl Track {
         uncertainty: &CameraUncertainty,
         motion: &MotionSetup,
     ) -> Option<TrackExpectation> {
-        let interval = time.seconds_since(self.updated);
+        let interval = time.seconds_since(self.updated_at);
         let errors = self.errors_of(camera, interval);
         // For the following camera itself the uncertain range moves no bearing: it has one
         // direction.

@@ -4,7 +4,7 @@
 use crossfix_geometry::{BearingModel, SightLine};
 use nalgebra::{Matrix2, Matrix3, Matrix6, Point3};
 
-use super::{Track, TrackBearing};
+use super::{FusedTrack, TrackBearing};
 use crate::spatial::{Observability, VAGUE_VELOCITY_SD};
 use crate::uncertainty::CameraUncertainty;
 
@@ -20,12 +20,12 @@ const INFORMATION_S: f64 = 1.0;
 /// is known better than this. With half of it a position known to 15 m no longer counts.
 const POSITION_SCALE_M: f64 = 20.0;
 
-impl Track {
+impl FusedTrack {
     /// Adds a bearing's Fisher information to that of the recent bearings, which is carried on to
     /// its time and faded with [`INFORMATION_S`].
     pub(super) fn gather_information(&mut self, bearing: &TrackBearing<'_>) {
         let TrackBearing { camera, time: now, line, uncertainty } = *bearing;
-        let interval = now.seconds_since(self.updated);
+        let interval = now.seconds_since(self.updated_at);
         let old = &self.information;
         let block = |row: usize, column: usize| old.fixed_view::<3, 3>(row, column).into_owned();
         let (places, ties, speeds) = (block(0, 0), block(0, 3), block(3, 3));
@@ -53,14 +53,14 @@ impl Track {
 
     /// Computes the observability again if that was last done [`OBSERVABILITY_INTERVAL_S`] ago.
     pub(crate) fn observe_again(&mut self) {
-        if self.updated.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
+        if self.updated_at.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
             self.observe();
         }
     }
 
     /// Computes which directions of position and velocity the recent bearings determine.
     pub(crate) fn observe(&mut self) {
-        self.observed = self.updated;
+        self.observed = self.updated_at;
         self.observability =
             Observability::of_information(&self.information, POSITION_SCALE_M, VAGUE_VELOCITY_SD);
     }

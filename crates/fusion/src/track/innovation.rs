@@ -5,13 +5,14 @@ use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::Timestamp;
 use nalgebra::Vector2;
 
-use super::{Track, TrackBearing};
+use super::{FusedTrack, TrackBearing};
 use crate::motion::{ManoeuvreDetector, MotionSetup};
+use crate::prediction::MahalanobisDistance;
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
 /// The innovation of a bearing.
 pub(super) struct BearingInnovation {
-    pub(super) offset: Vector2<f64>,
+    pub(super) residual: Vector2<f64>,
     pub(super) model: BearingModel,
 }
 
@@ -23,14 +24,13 @@ struct Against<'a> {
 }
 
 impl Against<'_> {
-    /// The squared Mahalanobis distance of an innovation, and the determinant of its covariance,
-    /// rad^4, by what is known of the camera's errors.
+    /// The distance of an innovation, by what is known of the camera's errors.
     fn distance(
         &self,
         innovation: &BearingInnovation,
         errors: &SharedErrors,
-    ) -> Option<(f64, f64)> {
-        let BearingInnovation { offset, model } = innovation;
+    ) -> Option<MahalanobisDistance> {
+        let BearingInnovation { residual, model } = innovation;
         let by = model.by_position();
         let shifts = self.uncertainty.shifts(model, self.before.velocity());
         // S = H P H' + H X J' + J X' H' + J W J' + f R: the camera's errors (effect J, covariance
@@ -42,9 +42,10 @@ impl Against<'_> {
             + errors.spread(&shifts)
             + model.covariance_of(self.line) * self.uncertainty.factor;
         // z - J E(s).
-        let offset = offset - shifts * errors.mean;
+        let residual = residual - shifts * errors.mean;
         let factor = spread.cholesky()?;
-        Some((offset.dot(&factor.solve(&offset)), factor.determinant()))
+        let squared = residual.dot(&factor.solve(&residual));
+        Some(MahalanobisDistance { squared, determinant: factor.determinant() })
     }
 
     /// Logarithm of the likelihood of errors that have this probability; the constant 2 pi is left
@@ -55,12 +56,12 @@ impl Against<'_> {
         errors: &SharedErrors,
         probability: f64,
     ) -> Option<f64> {
-        let (squared, determinant) = self.distance(innovation, errors)?;
+        let MahalanobisDistance { squared, determinant } = self.distance(innovation, errors)?;
         Some(probability.ln() - (squared + determinant.ln()) / 2.0)
     }
 }
 
-impl Track {
+impl FusedTrack {
     /// The innovation of a bearing; `None` if it points away from the target.
     pub(super) fn innovation(
         &self,
@@ -68,7 +69,7 @@ impl Track {
         line: &SightLine,
     ) -> Option<BearingInnovation> {
         let model = BearingModel::new(line.origin, self.position_at(time))?;
-        Some(BearingInnovation { offset: model.offset(line)?, model })
+        Some(BearingInnovation { residual: model.offset(line)?, model })
     }
 
     /// The innovation's squared Mahalanobis distance; the reported covariance counts by the factor
@@ -80,11 +81,11 @@ impl Track {
         motion: &MotionSetup,
     ) -> Option<f64> {
         let TrackBearing { camera, time, line, uncertainty } = *bearing;
-        let interval = time.seconds_since(self.updated);
+        let interval = time.seconds_since(self.updated_at);
         let before = self.imm.predicted(interval, motion.models(self.ranged));
         let errors = self.errors_of(camera, interval);
         let against = Against { before: &before, line, uncertainty };
-        Some(against.distance(innovation, &errors)?.0)
+        Some(against.distance(innovation, &errors)?.squared)
     }
 
     /// What is known of a camera's errors if this bearing makes it likelier that the lasting ones
@@ -96,13 +97,14 @@ impl Track {
         errors: &SharedErrors,
         motion: &MotionSetup,
     ) -> Option<SharedErrors> {
-        let (anew, probability) = errors.renewed()?;
+        let (drawn_again, probability) = errors.renewed()?;
         let TrackBearing { time, line, uncertainty, .. } = *bearing;
-        let interval = time.seconds_since(self.updated);
+        let interval = time.seconds_since(self.updated_at);
         let before = self.imm.predicted(interval, motion.models(self.ranged));
         let against = Against { before: &before, line, uncertainty };
         let went_on = against.log_likelihood(innovation, errors, 1.0 - probability);
-        (against.log_likelihood(innovation, &anew, probability) > went_on).then_some(anew)
+        (against.log_likelihood(innovation, &drawn_again, probability) > went_on)
+            .then_some(drawn_again)
     }
 
     /// Whether the manoeuvre detector fires on a bearing.
@@ -115,13 +117,16 @@ impl Track {
         let nis = matches!(self.detector, Some(ManoeuvreDetector::Innovation(_)))
             .then(|| self.nis(innovation, bearing, motion))
             .flatten();
-        self.detector.as_mut().is_some_and(|detector| match detector {
-            ManoeuvreDetector::Residual(detector) => {
+        match &mut self.detector {
+            Some(ManoeuvreDetector::Residual(detector)) => {
                 // In the axes of the world, so that residuals of different cameras can be averaged.
                 let spread = bearing.line.standard_deviation();
-                detector.see(innovation.model.basis * innovation.offset / spread)
+                detector.see(innovation.model.basis * innovation.residual / spread)
             }
-            ManoeuvreDetector::Innovation(detector) => nis.is_some_and(|nis| detector.see(nis, 2)),
-        })
+            Some(ManoeuvreDetector::Innovation(detector)) => {
+                nis.is_some_and(|nis| detector.see(nis, 2))
+            }
+            None => false,
+        }
     }
 }

@@ -15,9 +15,9 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, Dyn, Matrix2, Matrix6, OMatrix, U2, U5, U6, Vector2};
 
 use super::ties::Rescaling;
-use super::{Ties, Track};
+use super::{FusedTrack, Ties};
 use crate::uncertainty::{CONSIDERED, CorrelatedNoise, LASTING, SharedCovariance, SharedErrors};
-use crate::update::Told;
+use crate::update::CrossUpdate;
 
 /// Most cameras whose lasting errors a track learns, as an update's cost grows with the square of
 /// their number; the errors of the others are considered. With half as many, the velocities of a
@@ -59,7 +59,7 @@ impl Learnt {
     }
 }
 
-impl Track {
+impl FusedTrack {
     /// What is known of a camera's shared errors, `interval` seconds after the track's last update.
     pub(super) fn errors_of(&self, camera: &CameraName, interval: f64) -> SharedErrors {
         let Some(ties) = self.ties.get(camera) else {
@@ -84,7 +84,7 @@ impl Track {
                 .copy_from(&considered.transpose());
             errors.mean.fixed_rows_mut::<2>(LASTING).copy_from(&mean);
             // An error with decay time T is drawn again at a rate of 1/T: P = 1 - exp(-t / T).
-            let silent_s = ties.silent_s(self.updated).unwrap_or(0.0) + interval;
+            let silent_s = ties.silent_s(self.updated_at).unwrap_or(0.0) + interval;
             errors.renewal = Some(1.0 - ties.kept(silent_s));
         }
         errors
@@ -96,7 +96,7 @@ impl Track {
     }
 
     /// Predicts all ties and learnt errors over `interval` seconds.
-    pub(super) fn pass(&mut self, interval: f64) {
+    pub(super) fn predict_ties(&mut self, interval: f64) {
         let kept: Vec<f64> = self
             .learnt
             .cameras
@@ -221,7 +221,7 @@ impl Track {
 
     /// Updates the ties to all cameras' errors with a bearing of one camera, and the estimates of
     /// the lasting errors.
-    pub(super) fn learn(&mut self, camera: &CameraName, told: &Told) {
+    pub(super) fn learn(&mut self, camera: &CameraName, told: &CrossUpdate) {
         if self.learnt.is_empty() {
             // Without learnt errors no camera's errors are correlated with another's:
             // X <- (I - K H) X, and for the bearing's own camera X <- (I - K H) X - K J.
@@ -280,7 +280,7 @@ impl Track {
     }
 
     /// Covariance A of the learnt errors with a bearing of a camera: A = L J' + X' H'.
-    fn across(&self, camera: &CameraName, told: &Told) -> OMatrix<f64, Dyn, U2> {
+    fn across(&self, camera: &CameraName, told: &CrossUpdate) -> OMatrix<f64, Dyn, U2> {
         let Some(own) = self.ties.get(camera) else {
             return OMatrix::<f64, Dyn, U2>::zeros(self.learnt.count());
         };

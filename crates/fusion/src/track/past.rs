@@ -8,14 +8,14 @@ use crossfix_filter::KinematicState;
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2x5, Matrix6, Matrix6x2, Vector6};
 
-use super::Track;
+use super::FusedTrack;
 use super::ties::Rescaling;
 use crate::motion::MotionSetup;
 use crate::uncertainty::{LASTING, SharedTies};
-use crate::update::Told;
+use crate::update::CrossUpdate;
 
 /// Upper limit of the share of a past state's covariance that the present state explains: rounding
-/// takes the rest.
+/// takes the rest. With half of that rest the same.
 const CLOSEST: f64 = 1.0 - 1e-9;
 
 /// The state of a track at an earlier time, with what later bearings tell of it.
@@ -34,7 +34,7 @@ pub(super) struct PastState {
 
 impl PastState {
     /// Carries `with_now` on to a later present time: the position moves with the velocity.
-    fn pass(&mut self, to: Timestamp, interval: f64) {
+    fn predict(&mut self, to: Timestamp, interval: f64) {
         let velocity = self.with_now.fixed_rows::<3>(3).into_owned();
         // N <- F N; the past state itself does not move.
         let mut position = self.with_now.fixed_rows_mut::<3>(0);
@@ -55,7 +55,12 @@ impl PastState {
 
     /// Updates the past state with a bearing of a camera; `seen` says how the bearing is correlated
     /// with each camera's errors.
-    fn learn(&mut self, camera: &CameraName, told: &Told, seen: &[BearingErrorCovariance<'_>]) {
+    fn learn(
+        &mut self,
+        camera: &CameraName,
+        told: &CrossUpdate,
+        seen: &[BearingErrorCovariance<'_>],
+    ) {
         let own = *self.ties_to(camera);
         // A = cov(past, bearing) = N' H' + X J', with N = `with_now` and X the ties to the
         // bearing's camera. Mean += A S^-1 z; covariance -= A (S^-1 - spread over the models) A'.
@@ -128,11 +133,11 @@ struct BearingErrorCovariance<'a> {
     is_learnt: bool,
 }
 
-impl Track {
+impl FusedTrack {
     /// Stores the track's state at a time, so that later bearings can smooth it.
     pub(crate) fn remember(&mut self, time: Timestamp, motion: &MotionSetup) {
         let state = self.predicted(time, motion);
-        let interval = time.seconds_since(self.updated);
+        let interval = time.seconds_since(self.updated_at);
         let ties =
             self.ties.iter().map(|(name, ties)| (name.clone(), ties.predicted(interval))).collect();
         // At first the past state is the present one: N = P.
@@ -176,7 +181,7 @@ impl Track {
     }
 
     /// Carries the stored states' correlations to a new present time.
-    pub(super) fn pass_past(&mut self, to: Timestamp) {
+    pub(super) fn predict_past(&mut self, to: Timestamp) {
         for past in self.past.iter_mut().filter(|past| !past.is_settled) {
             let interval = to.seconds_since(past.carried_to);
             for (name, own) in &mut past.ties {
@@ -185,13 +190,13 @@ impl Track {
                 let mut lasting = own.fixed_columns_mut::<2>(LASTING);
                 lasting *= ties.kept(interval);
             }
-            past.pass(to, interval);
+            past.predict(to, interval);
         }
     }
 
     /// Updates the stored states with a bearing; called before the track's own ties are updated
     /// with it.
-    pub(super) fn look_back(&mut self, camera: &CameraName, told: &Told) {
+    pub(super) fn update_past(&mut self, camera: &CameraName, told: &CrossUpdate) {
         if self.past.is_empty() {
             return;
         }

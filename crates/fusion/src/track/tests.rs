@@ -44,14 +44,14 @@ fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
             solver: Solver::Map,
             observability: first.observability(),
         };
-        let mut track = Track::start(&fix, [], &motion);
+        let mut track = FusedTrack::start(&fix, [], &motion);
         for timed in &lines[3..] {
             let (time, line) = (timed.time, &timed.line);
             let uncertainty = &CameraUncertainty::of_time(0.0);
             let bearing = TrackBearing { camera: &name, time, line, uncertainty };
             track.measurement_update(bearing, &motion).unwrap();
         }
-        let t = track.updated.seconds();
+        let t = track.updated_at.seconds();
         let truth = Vector6::from_iterator(at(t).iter().chain(velocity.iter()).copied());
         let error = track.state().mean - truth;
         nees += (error.transpose() * track.state().covariance.try_inverse().unwrap() * error).x;
@@ -168,7 +168,7 @@ fn flown(
         solver: Solver::Map,
         observability: Observability::of_information(&Matrix6::identity(), 1.0, 1.0),
     };
-    let mut track = Track::start(&fix, [], &motion);
+    let mut track = FusedTrack::start(&fix, [], &motion);
     let step = FRAME_S / 3.0;
     let mut before = (start, truth);
     for k in 0..540 {

@@ -10,11 +10,11 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Unit, Vector2, Vector3};
 
 use super::learnt::LearntTies;
-use super::{BearingInnovation, Track, TrackBearing};
+use super::{BearingInnovation, FusedTrack, TrackBearing};
 use crate::cameras::{ClockChange, RecentBearings, ScaleSample, ThirdDifferences};
 use crate::motion::MotionSetup;
 use crate::uncertainty::{CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies};
-use crate::update::{ModelUpdate, Told, Updated};
+use crate::update::{CrossUpdate, ModelUpdate, Updated};
 use crate::visibility::Visibility;
 
 /// A change of the variance of errors that a track is tied to.
@@ -31,12 +31,14 @@ pub(super) struct Rescaling {
 /// longer intervals noise cannot be told from jerk. By default that is 0.15 s: with half of it
 /// cameras of 10 Hz show nothing of their white noise.
 const CLOSE_BEARINGS: f64 = 0.1;
-/// A draw (one comparison of the cameras' mean offsets from the target) lasts this long, s: long
-/// enough for some bearings of each camera, short enough to see a mast sway.
+/// A draw (one comparison of the cameras' mean residuals from the target) lasts this long, s: long
+/// enough for some bearings of each camera, short enough to see a mast sway. With half of it
+/// cameras of 5 Hz have one bearing per draw, or none.
 const DRAW_S: f64 = 0.3;
 
 /// A camera supports the track for at least this many times the interval between its last two
-/// bearings: the next one may be late, but none may be missed, ...
+/// bearings: the next one may be late (with half of it every next one is too late), but none may
+/// be missed, ...
 const HOLDING_PERIODS: f64 = 1.5;
 /// ... with intervals counted as no longer than this many times the holding time. With half of it a
 /// camera with a bearing every other holding time loses the target between any two.
@@ -48,15 +50,15 @@ const LONGEST_PERIOD: f64 = 2.0;
 /// misses are taken for a loss.
 const MISSED: f64 = 0.2;
 
-/// Something beside the target is steady if from draw to draw its offset changes by less than this
-/// share of the offset, ...
+/// Something beside the target is steady if from draw to draw its residual changes by less than
+/// this share of the residual, ...
 const STEADY: f64 = 0.2;
 /// ... for this many draws in a row, a second and a half. With half of it, what flies past in the
 /// same direction is taken for the target. With half of the share, the track's own wander ends the
 /// row.
 const STEADY_DRAWS: u32 = 5;
-/// At least this many cameras must have it beside the target: a single one may be turned, and it is
-/// for the others to accuse it.
+/// At least this many cameras must have it beside the target: a single one (half of it) may be
+/// turned, and it is for the others to accuse it.
 const LEAST_BESIDE: usize = 2;
 
 /// The ties of a track to one camera that has seen it, and how that camera sees the target.
@@ -80,15 +82,15 @@ pub(super) struct Ties {
     pub(super) drawn: Option<Drawn>,
     /// The same for what it has seen beside the target, when it has not seen the target itself.
     beside: Option<Drawn>,
-    /// The offset of that in the last draw (rad), and for how many draws it has stayed there.
+    /// The residual of that in the last draw (rad), and for how many draws it has stayed there.
     steady: (Vector2<f64>, u32),
 }
 
 /// A camera's bearings of the target since the last draw, summed: see `cameras/pose_scale.rs`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Drawn {
-    /// Sum of the offsets from the track, rad, and their number.
-    offsets: Vector2<f64>,
+    /// Sum of the residuals from the track, rad, and their number.
+    residuals: Vector2<f64>,
     count: f64,
     by_position: Matrix2x3<f64>,
     /// Covariance of one bearing's noise, rad^2.
@@ -110,10 +112,10 @@ impl Drawn {
         velocity: Vector3<f64>,
         TrackBearing { line, uncertainty, .. }: &TrackBearing<'_>,
     ) -> Self {
-        let (offsets, count) =
-            before.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.offsets, drawn.count));
+        let (residuals, count) =
+            before.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.residuals, drawn.count));
         Self {
-            offsets: offsets + innovation.offset,
+            residuals: residuals + innovation.residual,
             count: count + 1.0,
             by_position: innovation.model.by_position(),
             noise: innovation.model.covariance_of(line) * uncertainty.factor,
@@ -125,7 +127,7 @@ impl Drawn {
         }
     }
 
-    /// The mean offset as a sample, for a target whose velocity has a standard deviation of
+    /// The mean residual as a sample, for a target whose velocity has a standard deviation of
     /// `speed`, m/s.
     fn sample(self, camera: &CameraName, speed: f64) -> ScaleSample {
         // The mean times of the cameras' bearings differ, by a tenth of a draw as assumed here.
@@ -138,7 +140,7 @@ impl Drawn {
         let lasting = Matrix2::identity() * self.lasting.as_white(DRAW_S);
         ScaleSample {
             camera: camera.clone(),
-            offset: self.offsets / self.count,
+            residual: self.residuals / self.count,
             by_position: self.by_position,
             // The lasting part does not average out within a draw; for the watch, over many draws,
             // it does as slowly as white noise of `as_white`.
@@ -156,9 +158,9 @@ impl Ties {
     /// same place for at least [`STEADY_DRAWS`] draws.
     fn steady_beside(&mut self) -> Option<Drawn> {
         let beside = self.beside.take().filter(|_| self.drawn.is_none());
-        let place = beside.map(|drawn| drawn.offsets / drawn.count);
+        let place = beside.map(|drawn| drawn.residuals / drawn.count);
         let (before, draws) = self.steady;
-        // The offset may change by a share of itself: what passes by changes it by more.
+        // The residual may change by a share of itself: what passes by changes it by more.
         let stays = place.is_some_and(|place| (place - before).norm() < STEADY * before.norm());
         self.steady =
             place.map_or((Vector2::zeros(), 0), |place| (place, if stays { draws + 1 } else { 0 }));
@@ -258,7 +260,7 @@ impl Ties {
     }
 }
 
-impl Track {
+impl FusedTrack {
     /// Adds a bearing of the target to the next draw.
     pub(super) fn gather(&mut self, bearing: &TrackBearing<'_>, innovation: &BearingInnovation) {
         let velocity = self.state().velocity();
@@ -277,15 +279,15 @@ impl Track {
         }
     }
 
-    /// The cameras' mean offsets since the last draw, if the next draw is due; empty otherwise. If
-    /// at least as many cameras as see the target have for long had something beside it in the same
-    /// place, that is the target, and their poses are worse than stated: these offsets are then
-    /// included.
+    /// The cameras' mean residuals since the last draw, if the next draw is due; empty otherwise.
+    /// If at least as many cameras as see the target have for long had something beside it in the
+    /// same place, that is the target, and their poses are worse than stated: these residuals are
+    /// then included.
     pub(crate) fn draw(&mut self) -> Vec<ScaleSample> {
-        if self.updated.seconds_since(self.drawn) < DRAW_S {
+        if self.updated_at.seconds_since(self.drawn) < DRAW_S {
             return Vec::new();
         }
-        self.drawn = self.updated;
+        self.drawn = self.updated_at;
         // The cameras see the target at different times within a draw: an uncertain velocity moves
         // it in between.
         let speed = self.state().covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt();
@@ -362,7 +364,7 @@ impl Track {
         line: &SightLine,
         motion: &MotionSetup,
     ) -> Option<ThirdDifferences> {
-        let (now, state) = (self.updated, self.imm.combined());
+        let (now, state) = (self.updated_at, self.imm.combined());
         let (place, velocity) = (state.position(), state.velocity());
         let expected = |time: Timestamp| {
             Unit::try_new(place + velocity * time.seconds_since(now) - line.origin, 1e-6)
@@ -385,14 +387,14 @@ impl Track {
             Some(ModelUpdate { after: result.as_ref()?, probability })
         });
         let nis = models.clone().map(|model| model.after.nis * model.probability).sum();
-        let told = Told::over(models);
-        self.note(camera, self.updated);
+        let told = CrossUpdate::over(models);
+        self.note(camera, self.updated_at);
         // First all is predicted, then updated; the past states first, as they need the ties before
         // the update.
-        self.pass_past(time);
-        self.pass(time.seconds_since(self.updated));
+        self.predict_past(time);
+        self.predict_ties(time.seconds_since(self.updated_at));
         self.begin_to_learn(camera, lasting, time);
-        self.look_back(camera, &told);
+        self.update_past(camera, &told);
         self.learn(camera, &told);
         if let Some(ties) = self.ties.get_mut(camera) {
             ties.lasting_s = lasting.time_s;

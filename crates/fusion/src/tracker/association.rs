@@ -10,7 +10,7 @@ use crate::cameras::Fitting;
 use crate::cameras::KnownCamera;
 use crate::motion::MotionSetup;
 use crate::reacquisition::FOUND_AGAIN_MARGIN;
-use crate::track::{Track, TrackId, TrackStatus};
+use crate::track::{FusedTrack, TrackId, TrackStatus};
 use crate::visibility::log_missed;
 use crate::{Exposure, Sighting, Tracking};
 
@@ -34,7 +34,8 @@ impl Tracker {
     pub(super) fn in_order_of_choice(&self) -> [Vec<TrackId>; 3] {
         let mut order = [const { Vec::new() }; 3];
         for track in self.tracks.values().filter(|track| track.status != TrackStatus::Lost) {
-            let place = if !track.is_confirmed() { 2 } else { usize::from(!track.is_held()) };
+            let place =
+                if !track.is_confirmed() { 2 } else { usize::from(!track.is_triangulated()) };
             order[place].push(track.id);
         }
         order
@@ -53,7 +54,7 @@ impl Tracker {
         let candidates = self.candidates(exposure, known, owners, ids);
         let gains: BTreeMap<(usize, usize), f64> =
             candidates.iter().map(|c| ((c.row, c.column), c.gain)).collect();
-        let partner: BTreeMap<usize, usize> = assign(&candidates).into_iter().collect();
+        let partner = assign(&candidates);
         for (row, id) in ids.iter().enumerate() {
             let Some(track) = self.tracks.get_mut(id) else {
                 continue;
@@ -69,7 +70,7 @@ impl Tracker {
             });
             let gain = taken.and(column).and_then(|column| gains.get(&(row, column))).copied();
             let sees = known.expects(track.position_at(exposure.time), self.max_range_m);
-            if sure && taken.is_none() && track.is_held() {
+            if sure && taken.is_none() && track.is_triangulated() {
                 note_beside(track, exposure, known);
             }
             if sure && (taken.is_some() || sees) {
@@ -81,12 +82,12 @@ impl Tracker {
                 .extend(taken.filter(|_| sure).and_then(|taken| taken.third_differences));
             let evidence = Evidence { gain, sees, sure };
             let change = evidence.score_change(track, exposure, &self.config, &self.motion);
-            track.judge(change, MAX_SCORE);
+            track.add_evidence(change, MAX_SCORE);
             // A camera misses nothing outside its field of view.
             if gain.is_some() || sees {
                 let detection = self.config.detection_probability;
                 let (camera, time) = (&exposure.camera, exposure.time);
-                track.look(camera, time, gain.is_some(), detection, &self.motion);
+                track.note_visibility(camera, time, gain.is_some(), detection, &self.motion);
             }
             if taken.is_some_and(|taken| taken.manoeuvre) {
                 noted.changes.push(TrackChange::new(TrackEventKind::Manoeuvre, *id));
@@ -158,20 +159,20 @@ impl Evidence {
     /// By how much it changes the track's score; the track has been updated with its bearing.
     fn score_change(
         &self,
-        track: &Track,
+        track: &FusedTrack,
         exposure: &Exposure,
         config: &Tracking,
         motion: &MotionSetup,
     ) -> f64 {
         let visible = track.visible_to(&exposure.camera, exposure.time, motion);
         let missed = log_missed(visible, config.detection_probability);
-        let silent_s = exposure.time.seconds_since(track.updated);
+        let silent_s = exposure.time.seconds_since(track.updated_at);
         let silent = self.sure && silent_s > config.coasting_after_s;
-        let seen_since = !self.sure || track.is_seen_since_look_of(&exposure.camera);
+        let seen_since = !self.sure || track.is_seen_since_exposure_of(&exposure.camera);
         match self.gain {
             // No evidence for the target: what one camera alone follows may be anything along its
             // sight line.
-            Some(_) if self.sure && !track.is_held() => 0.0,
+            Some(_) if self.sure && !track.is_triangulated() => 0.0,
             // The gain was counted against a miss, ln(P_D N / clutter) - ln(1 - P_D): the score
             // wants the first term alone.
             Some(gain) => gain + missed,
@@ -184,7 +185,7 @@ impl Evidence {
 }
 
 /// Notes the line that passes nearest to a track, for an exposure that has no bearing of it.
-fn note_beside(track: &mut Track, exposure: &Exposure, known: &KnownCamera) {
+fn note_beside(track: &mut FusedTrack, exposure: &Exposure, known: &KnownCamera) {
     let expected = track.position_at(exposure.time) - known.camera.pose().position();
     let away = |sighting: &Sighting| sighting.line.direction.angle(&expected);
     let beside = exposure.sightings.iter().filter(|sighting| away(sighting) < BESIDE_RAD);
@@ -196,7 +197,7 @@ fn note_beside(track: &mut Track, exposure: &Exposure, known: &KnownCamera) {
 /// How an exposure fits a track that other cameras see; `None` if it has no bearing of the track
 /// and none beside it, and so says nothing.
 pub(super) fn fitting(
-    track: &Track,
+    track: &FusedTrack,
     exposure: &Exposure,
     known: &KnownCamera,
     seen: bool,

@@ -1,12 +1,13 @@
 //! The life cycle of tracks: start, confirmation, coasting, merging, loss.
 
 use crossfix_message::{Timestamp, TrackEventKind, track_id};
+use nalgebra::Point3;
 
 use super::{TrackChange, Tracker, mahalanobis_squared, same_target};
-use crate::cameras::Cameras;
-use crate::initiation::Start;
+use crate::cameras::{Cameras, KnownCamera};
+use crate::initiation::NewTrack;
 use crate::motion::MotionSetup;
-use crate::track::{Track, TrackId, TrackStatus};
+use crate::track::{FusedTrack, TrackId, TrackStatus};
 
 /// Size of the smallest target that is found, px: tracks closer together than this for every camera
 /// are one target. With half of it the two ends of a target make two tracks; with twice as much,
@@ -30,7 +31,7 @@ impl Tracker {
     pub(super) fn review(&mut self, now: Timestamp) -> Vec<TrackChange> {
         let mut changes = Vec::new();
         for track in self.tracks.values_mut() {
-            let silent_s = now.seconds_since(track.updated);
+            let silent_s = now.seconds_since(track.updated_at);
             let unseen = silent_s > self.config.coasting_after_s;
             let hopeless = silent_s > self.config.lost_after_s
                 || (unseen
@@ -64,7 +65,7 @@ impl Tracker {
     /// the live one goes on.
     pub(super) fn merge(&mut self, now: Timestamp) -> Vec<TrackChange> {
         let coasting = self.tracks.values().filter(|t| t.status == TrackStatus::Coasting);
-        let live: Vec<&Track> =
+        let live: Vec<&FusedTrack> =
             self.tracks.values().filter(|t| t.status == TrackStatus::Confirmed).collect();
         let merged: Vec<(TrackId, TrackId)> = coasting
             .filter_map(|old| {
@@ -123,13 +124,13 @@ impl Tracker {
     /// that track may have gone, it is the same target found again and goes on under the old
     /// number. If it lies elsewhere, the old track was wrong and is ended; but two cameras are not
     /// enough to say so, as their lines cross anywhere.
-    pub(crate) fn adopt(&mut self, start: Start, cameras: &Cameras) -> Vec<TrackChange> {
-        let Start { mut track, cameras: seen_by, claimed_by } = start;
-        let owners = claimed_by.iter().filter_map(|id| self.tracks.get(id));
-        let unheld: Vec<&Track> =
-            owners.filter(|old| old.is_confirmed() && !old.is_held()).collect();
-        let same = unheld.iter().find(|old| {
-            let expected = old.predicted(track.updated, &self.motion);
+    pub(crate) fn adopt(&mut self, start: NewTrack, cameras: &Cameras) -> Vec<TrackChange> {
+        let NewTrack { mut track, cameras: seen_by, provisional_owners } = start;
+        let owners = provisional_owners.iter().filter_map(|id| self.tracks.get(id));
+        let alone: Vec<&FusedTrack> =
+            owners.filter(|old| old.is_confirmed() && !old.is_triangulated()).collect();
+        let same = alone.iter().find(|old| {
+            let expected = old.predicted(track.updated_at, &self.motion);
             mahalanobis_squared(&expected, track.state())
                 .is_some_and(|distance| distance < FOUND_AGAIN_GATE)
         });
@@ -146,16 +147,16 @@ impl Tracker {
         }
         if self.tracks.values().any(|old| {
             old.status == TrackStatus::Confirmed
-                && old.is_held()
-                && is_one_image(old, &track, track.updated, cameras)
+                && old.is_triangulated()
+                && is_one_image(old, &track, track.updated_at, cameras)
         }) {
             return Vec::new();
         }
-        let wrong: Vec<TrackId> = unheld.iter().map(|old| old.id).collect();
+        let wrong: Vec<TrackId> = alone.iter().map(|old| old.id).collect();
         if !wrong.is_empty() && seen_by < 3 {
             return Vec::new();
         }
-        let id = TrackId(track_id(self.began.unwrap_or(track.updated), self.next_number));
+        let id = TrackId(track_id(self.began.unwrap_or(track.updated_at), self.next_number));
         self.next_number += 1;
         track.id = id;
         let mut changes = vec![TrackChange::new(TrackEventKind::Born, id)];
@@ -174,7 +175,7 @@ impl Tracker {
 }
 
 /// Whether a young track is to be compared with the older ones once more.
-fn is_comparison_due(track: &Track, now: Timestamp) -> bool {
+fn is_comparison_due(track: &FusedTrack, now: Timestamp) -> bool {
     let next_s = f64::from(track.comparisons + 1) * COMPARED_EVERY_S;
     track.status == TrackStatus::Confirmed
         && track.comparisons < COMPARISONS
@@ -183,30 +184,32 @@ fn is_comparison_due(track: &Track, now: Timestamp) -> bool {
 
 /// Whether two tracks are one image ([`is_one_image`]) now and a moment later: two targets that
 /// only cross part again.
-fn stays_one_image(old: &Track, new: &Track, now: Timestamp, cameras: &Cameras) -> bool {
+fn stays_one_image(old: &FusedTrack, new: &FusedTrack, now: Timestamp, cameras: &Cameras) -> bool {
     [0.0, COMPARED_EVERY_S].iter().all(|&s| is_one_image(old, new, now.plus_seconds(s), cameras))
 }
 
 /// Whether two tracks lie so close together at a time, for every camera that sees the new one, that
 /// they are parts of one target: a detector may report its two ends.
-fn is_one_image(old: &Track, new: &Track, time: Timestamp, cameras: &Cameras) -> bool {
-    let [there, here] = [old.position_at(time), new.position_at(time)];
+fn is_one_image(old: &FusedTrack, new: &FusedTrack, time: Timestamp, cameras: &Cameras) -> bool {
+    let places = [old.position_at(time), new.position_at(time)];
     // A target that was split once will be split again, and a track that is just beginning is less
     // certain in position: twice the distance is allowed.
     let times = if old.has_ends { 2.0 } else { 1.0 };
-    new.residuals.keys().all(|name| {
-        cameras.known(name).is_some_and(|known| {
-            // px / fx is the angle about the optical axis.
-            let smallest = SMALLEST_TARGET_PX / known.camera.model().intrinsics().fx;
-            let origin = known.camera.pose().position();
-            (there - origin).angle(&(here - origin)) < times * smallest
-        })
-    })
+    let mut known = new.residuals.keys().map(|name| cameras.known(name));
+    known.all(|known| known.is_some_and(|known| see_as_one(known, places, times)))
+}
+
+/// Whether two places are closer together for a camera than this many times the smallest target.
+fn see_as_one(known: &KnownCamera, [there, here]: [Point3<f64>; 2], times: f64) -> bool {
+    // px / fx is the angle about the optical axis.
+    let smallest = SMALLEST_TARGET_PX / known.camera.model().intrinsics().fx;
+    let origin = known.camera.pose().position();
+    (there - origin).angle(&(here - origin)) < times * smallest
 }
 
 /// Root of the summed variances of the predicted position, m: at least the standard deviation along
 /// any axis.
-fn position_sd(track: &Track, now: Timestamp, motion: &MotionSetup) -> f64 {
+fn position_sd(track: &FusedTrack, now: Timestamp, motion: &MotionSetup) -> f64 {
     let state = track.predicted(now, motion);
     state.covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()
 }

@@ -237,7 +237,7 @@ impl Tally {
                 let track = found(fusion, path);
                 self.there += usize::from(track.is_some());
                 if let Some(track) = track.filter(|_| time > 30.0) {
-                    let truth = path(track.updated.seconds()).unwrap();
+                    let truth = path(track.updated_at.seconds()).unwrap();
                     self.distances.push((track.state().position() - truth).norm_squared());
                 }
             }

@@ -1,8 +1,8 @@
-//! A scene flown before a fusion centre, step by step, with its tracks held against the truth.
+//! A scene flown before a fusion centre, step by step, with its tracks compared with the truth.
 
 use std::vec::IntoIter;
 
-use crossfix_fusion::{Fusion, FusionConfig, Track, TrackStatus};
+use crossfix_fusion::{FusedTrack, Fusion, FusionConfig, TrackStatus};
 use crossfix_message::BearingFrame;
 use nalgebra::{Vector3, Vector6};
 
@@ -49,7 +49,7 @@ impl Flight {
     }
 
     /// The track of a target.
-    pub fn track(&self, target: usize) -> Option<&Track> {
+    pub fn track(&self, target: usize) -> Option<&FusedTrack> {
         found(&self.fusion, &self.paths[target])
     }
 
@@ -66,7 +66,7 @@ impl Flight {
     /// How far a target's track is off, m, having checked that its covariance can be true.
     pub fn error(&self, target: usize) -> f64 {
         let track = self.track(target).unwrap();
-        let truth = self.paths[target](track.updated.seconds()).unwrap();
+        let truth = self.paths[target](track.updated_at.seconds()).unwrap();
         let error: Vector3<f64> = track.state().position() - truth;
         let spread = track.state().position_covariance();
         let squared = error.dot(&spread.cholesky().unwrap().solve(&error));
@@ -79,7 +79,7 @@ impl Flight {
     pub fn nees(&self, target: usize) -> f64 {
         let track = self.track(target).unwrap();
         let at = |t: f64| self.paths[target](t).unwrap();
-        let now = track.updated.seconds();
+        let now = track.updated_at.seconds();
         let (position, velocity) = (at(now), (at(now + 5e-4) - at(now - 5e-4)) / 1e-3);
         let truth = Vector6::from_iterator(position.iter().chain(velocity.iter()).copied());
         let error = track.state().mean - truth;

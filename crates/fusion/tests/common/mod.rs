@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use crossfix_fusion::{Fusion, FusionConfig, Track};
+use crossfix_fusion::{FusedTrack, Fusion, FusionConfig};
 use crossfix_geometry::{
     Bearing, Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose, tangent_basis,
 };
@@ -97,9 +97,10 @@ pub fn calibration(eye: &Eye) -> CameraCalibration {
 
 /// The confirmed track within three metres of a path at its own time, the nearest if there are
 /// more.
-pub fn found<'a>(fusion: &'a Fusion, path: &Path) -> Option<&'a Track> {
-    let distance =
-        |track: &Track| Some((track.state().position() - path(track.updated.seconds())?).norm());
+pub fn found<'a>(fusion: &'a Fusion, path: &Path) -> Option<&'a FusedTrack> {
+    let distance = |track: &FusedTrack| {
+        Some((track.state().position() - path(track.updated_at.seconds())?).norm())
+    };
     let near = fusion.tracks().filter(|track| track.is_confirmed());
     let near = near.filter_map(|track| Some((distance(track)?, track))).filter(|(d, _)| *d < 3.0);
     near.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, track)| track)

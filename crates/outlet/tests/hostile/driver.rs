@@ -1,4 +1,5 @@
-//! Reads any bytes as each message of the wire, and tells what can be read to everybody who is told.
+//! Reads any bytes as each message of the wire, and tells what can be read to everybody who is
+//! told.
 //!
 //! The first byte says what the rest is: a message of a channel, or what a SAPIENT parent answers.
 
@@ -7,7 +8,7 @@ use crossfix_message::{
     CameraCalibration, Channel, CueFrame, Health, Key, SiteName, Timestamp, TrackEvent, TrackFrame,
     TruthFrame, decode, glance,
 };
-use crossfix_outlet::foxglove::{FoxgloveView, Pictures};
+use crossfix_outlet::foxglove::{FoxgloveView, PictureExport};
 use crossfix_outlet::{
     Asterix, CursorOnTarget, GeoJsonFlights, GeoJsonLines, Kml, Outlet, Sapient, Situation,
 };
@@ -40,15 +41,15 @@ pub fn drive(data: &[u8]) {
     let _ = glance(channel, data);
     let _ = (decode::<CueFrame>(data), decode::<Health>(data), decode::<TruthFrame>(data));
     let anchor = Geodetic::from_degrees(48.0, 11.0, 500.0).expect("a place");
-    let mut view = FoxgloveView::new(&site(), Some(anchor), Pictures::Said);
+    let mut view = FoxgloveView::new(&site(), Some(anchor), PictureExport::Said);
     let _ = view.of(&Key::new(site(), channel.clone()), data, Timestamp::EPOCH);
     let mut situation = Situation::new(site(), anchor);
     if let Ok(calibration) = decode::<CameraCalibration>(data) {
         let _ = calibration.parse();
-        situation.hear_calibration(&calibration);
+        situation.add_calibration(&calibration);
     }
     if let Ok(frame) = decode::<TrackFrame>(data) {
-        situation.hear(None, &frame);
+        situation.add_tracks(None, &frame);
     }
     let mut outlets: [Box<dyn Outlet>; 6] = [
         Box::<CursorOnTarget>::default(),

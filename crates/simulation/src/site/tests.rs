@@ -34,7 +34,8 @@ fn bearings_point_at_the_truth_within_their_noise() {
 
 #[test]
 fn a_target_in_view_is_reported_as_often_as_it_should() {
-    let site = Site { detection_probability: 0.8, clutter: 0.0, range_m: 400.0, ..Site::default() };
+    let site =
+        Site { detection_probability: 0.8, false_bearings: 0.0, range_m: 400.0, ..Site::default() };
     let simulated = site.build().unwrap();
     let (mut seen, mut reported) = (0, 0);
     for exposure in simulated.bearings() {
@@ -48,8 +49,8 @@ fn a_target_in_view_is_reported_as_often_as_it_should() {
 }
 
 #[test]
-fn clutter_is_poisson_and_within_the_image() {
-    let site = Site { targets: 0, clutter: 5.0, ..Site::default() };
+fn false_bearings_are_poisson_and_within_the_image() {
+    let site = Site { targets: 0, false_bearings: 5.0, ..Site::default() };
     let simulated = site.build().unwrap();
     let (mut sum, mut squares, mut count) = (0.0, 0.0, 0.0);
     for SiteExposure { frame, .. } in simulated.bearings() {

@@ -96,7 +96,7 @@ fn areas_that_share_a_camera_are_linked_once_and_others_are_not() {
     assert_eq!(connects("west").0, ["tcp/127.0.0.1:7461"]);
     let (_, all) = network.endpoints(&Role::Observer).unwrap();
     assert_eq!(all.len(), 7, "who looks on hears every camera and every centre");
-    assert_eq!(network.heard_by(&"b".parse().unwrap()).len(), 2);
+    assert_eq!(network.areas_of(&"b".parse().unwrap()).len(), 2);
 }
 
 #[test]

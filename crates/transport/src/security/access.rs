@@ -56,7 +56,7 @@ impl Rights {
 
     fn rules(&self, site: &SiteName) -> Vec<Value> {
         let saying: Vec<&str> = SAYING.into_iter().chain(once(ANSWERING)).collect();
-        // A component publishes only once it is told of a subscriber. Who subscribes to what is no
+        // A component publishes only once it knows of a subscriber. Who subscribes to what is no
         // secret, so subscriptions may go out to all.
         let everything = [format!("crossfix/{site}/**")];
         [

@@ -59,7 +59,7 @@ pub struct Authority {
 pub struct Issued {
     /// The certificate.
     pub certificate: String,
-    /// Its private key (PKCS #8): its holder is taken for the component.
+    /// Its private key (PKCS #8): whoever has it counts as the component.
     pub key: String,
     /// When it expires.
     pub not_after: OffsetDateTime,

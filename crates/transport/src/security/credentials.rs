@@ -18,13 +18,20 @@ use super::{Identity, Security};
 #[derive(Debug, Error)]
 pub enum CredentialsError {
     /// A file is missing.
-    #[error("{} is not there: run `crossfix enroll`, and copy what it says to this host", path.display())]
+    #[error(
+        "{} is not there: run `crossfix enroll`, and copy what it says to this host",
+        path.display()
+    )]
     Missing {
         /// The file.
         path: PathBuf,
     },
     /// A file cannot be read.
-    #[error("cannot read {}: it must be readable to whoever runs this (chown root:crossfix, chmod 640)", path.display())]
+    #[error(
+        "cannot read {}: it must be readable to whoever runs this \
+         (chown root:crossfix, chmod 640)",
+        path.display()
+    )]
     Read {
         /// The file.
         path: PathBuf,
@@ -49,7 +56,11 @@ pub enum CredentialsError {
         ago: Duration,
     },
     /// The certificate is not valid yet.
-    #[error("the certificate {} begins in {}: is this host's clock right?", path.display(), days(*ahead))]
+    #[error(
+        "the certificate {} begins in {}: is this host's clock right?",
+        path.display(),
+        days(*ahead)
+    )]
     NotYet {
         /// The file.
         path: PathBuf,
@@ -58,8 +69,8 @@ pub enum CredentialsError {
     },
     /// It is another component's, or revoked: a number after the name counts the revocations.
     #[error(
-        "the certificate {} is of `{found}`, and the network file believes `{believed}` alone: it was \
-         revoked, or is another component's; copy the new one here",
+        "the certificate {} is of `{found}`, and the network file believes `{believed}` alone: it \
+         was revoked, or is another component's; copy the new one here",
         path.display()
     )]
     Name {

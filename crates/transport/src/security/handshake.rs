@@ -13,10 +13,11 @@ use x509_parser::parse_x509_certificate;
 use super::Credentials;
 use super::credentials::common_name;
 
-/// How long the other side may take to answer, and then to refuse a certificate. With half of the
-/// first, a host that takes longer than a second counts as absent; with half of the second, a
-/// refusal that takes 200 ms is taken for consent.
+/// How long the other side may take to answer. With half of it a host that takes longer than a
+/// second counts as absent.
 const ANSWER: Duration = Duration::from_secs(2);
+/// How long the other side may then take to refuse a certificate. With half of it a refusal that
+/// takes 200 ms would count as consent.
 const REFUSAL: Duration = Duration::from_millis(300);
 
 /// Why there is no link.

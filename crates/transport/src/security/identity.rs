@@ -22,15 +22,15 @@ use thiserror::Error;
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Identity {
-    /// A camera's agent: publishes what its camera sees, and hears the fusion centre.
+    /// A camera's agent: publishes what its camera sees, and receives what the fusion centre sends.
     Camera(CameraName),
-    /// The fusion centre, an area's or the only one: hears everything, publishes the tracks.
+    /// The fusion centre, an area's or the only one: receives everything, publishes the tracks.
     Fusion(Option<AreaName>),
-    /// The recorder: hears everything, publishes its health.
+    /// The recorder: receives everything, publishes its health.
     Recorder,
     /// A Zenoh router: carries everything, and enforces what each other component may publish.
     Router,
-    /// An observer (`view`, `status`, `outlet`): hears everything, publishes nothing.
+    /// An observer (`view`, `status`, `outlet`): receives everything, publishes nothing.
     Viewer,
 }
 

@@ -7,7 +7,7 @@
 //! a viewer nothing.
 //!
 //! Zenoh itself reports nothing if a link fails because of a certificate; [`Credentials`] and
-//! [`handshake`] tell why.
+//! [`handshake`] say why.
 
 mod access;
 mod authority;

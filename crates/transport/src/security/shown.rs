@@ -22,7 +22,7 @@ impl OwnCertificate {
     /// A component that connects reads its file for each connection; one that listens reads it at
     /// its start only.
     pub fn problem(&self, now: SystemTime) -> Option<String> {
-        let mend = "run `crossfix enroll`, copy it here, and start this again";
+        let remedy = "run `crossfix enroll`, copy it here, and start this again";
         let shown = match Credentials::load(&self.security, &self.identity, now) {
             Ok(credentials) => credentials.validity(),
             Err(error) => return Some(format!("{error}")),
@@ -30,8 +30,8 @@ impl OwnCertificate {
         let shown = if self.listens { self.at_start } else { shown };
         let left = shown.ending(now)?;
         Some(match left {
-            Duration::ZERO => format!("the certificate that it shows has ended: {mend}"),
-            _ => format!("the certificate that it shows ends in {}: {mend}", days(left)),
+            Duration::ZERO => format!("the certificate that it shows has ended: {remedy}"),
+            _ => format!("the certificate that it shows ends in {}: {remedy}", days(left)),
         })
     }
 

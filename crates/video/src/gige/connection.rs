@@ -12,18 +12,18 @@ use viva_genicam::{Camera, GigeRegisterIo};
 
 use super::description;
 
-/// Longest description that is read, bytes: memory for it is taken before it has come. Those of
+/// Longest description that is read, bytes: memory for it is allocated before it has come. Those of
 /// cameras have a megabyte, so half of it does the same.
 const MOST_DESCRIPTION_BYTES: usize = 64 << 20;
 
 /// A camera under control, which is given back when the camera is dropped.
-pub(super) struct Connection {
+pub(super) struct ControlledCamera {
     pub(super) camera: Camera<GigeRegisterIo>,
     /// Serves the camera's socket: it must be dropped after the camera.
     pub(super) runtime: Runtime,
 }
 
-impl Connection {
+impl ControlledCamera {
     /// Takes control of the camera at an address, and reads its description.
     ///
     /// # Errors

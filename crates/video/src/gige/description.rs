@@ -3,8 +3,8 @@
 //! `viva-genicam` follows references between features, and brackets in formulas, as deep as they
 //! go. A description whose references form a cycle, as faulty firmware may send it, would take all
 //! of the stack and end the process. What is refused here is that; a description that is wrong in
-//! any other way is the library's to judge. Somebody hostile on the cameras' network can still make
-//! the library work without an end (expressions that contain each other, chains of dependent
+//! any other way is the library's to decide. Somebody hostile on the cameras' network can still
+//! make the library work without an end (expressions that contain each other, chains of dependent
 //! features).
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -26,13 +26,13 @@ const MOST_NESTED: usize = 120;
 const MOST_OPERATORS: usize = 500;
 /// Elements within elements, at most: descriptions have five or so. With half of it the same.
 const MOST_ELEMENTS: usize = 1000;
-/// References that are followed when a value is read. Those to limits, and to what else changes
-/// with a value, may form cycles.
+/// Names of the references that are followed when a value is read. Those to limits, and to what
+/// else changes with a value, may form cycles.
 const OF_VALUES: [&str; 7] =
     ["pValue", "pVariable", "pAddress", "pIndex", "pLength", "pValueIndexed", "pValueDefault"];
-/// Elements that hold formulas.
+/// Names of the elements that hold formulas.
 const FORMULAS: [&str; 5] = ["Formula", "FormulaTo", "FormulaFrom", "Expression", "Constant"];
-/// What an operator of a formula may be written with.
+/// The characters of a formula's operators.
 const OPERATORS: &str = "+-*/%~!&|^<>=?:,";
 
 /// An element that has begun and not ended.
@@ -185,12 +185,10 @@ fn check_formula(formula: &str) -> Result<(), String> {
 /// itself, or through too many others.
 fn check_references(mut left: BTreeMap<Rc<str>, BTreeSet<String>>) -> Result<(), String> {
     for _ in 0..MOST_REFERENCES {
-        let waits = |others: &BTreeSet<String>| {
-            others.iter().any(|other| left.contains_key(other.as_str()))
-        };
+        let is_left = |other: &String| left.contains_key(other.as_str());
         let settled: Vec<Rc<str>> = left
             .iter()
-            .filter(|(_, others)| !waits(others))
+            .filter(|(_, others)| !others.iter().any(is_left))
             .map(|(feature, _)| feature.clone())
             .collect();
         settled.iter().for_each(|feature| _ = left.remove(feature));

@@ -1,5 +1,6 @@
 //! Industrial cameras (GigE Vision).
 
+mod clock;
 mod connection;
 mod description;
 
@@ -8,7 +9,6 @@ use std::time::{Duration, Instant};
 
 use crossfix_message::Timestamp;
 use tokio::runtime::Runtime;
-use viva_genicam::genapi::RegisterIo;
 use viva_genicam::gige::{DeviceInfo, Iface};
 use viva_genicam::pfnc::PixelFormat;
 use viva_genicam::{
@@ -16,7 +16,8 @@ use viva_genicam::{
     blocking,
 };
 
-use self::connection::{Connection, in_words};
+use self::clock::{ClockAnswer, TICKS_AT, eight_bytes, follows_another, latched};
+use self::connection::{ControlledCamera, in_words};
 use crate::stream_clock::{HostClock, StreamClock};
 use crate::{
     Arrival, CaptureTime, Frame, FrameSource, Losses, MOST_PIXELS, Pixels, StreamLatency, TimedBy,
@@ -27,52 +28,38 @@ use crate::{
 /// is given up after four times as long. With half of it a camera that is busy for 60 ms is asked
 /// twice.
 const ANSWERED_WITHIN: Duration = Duration::from_millis(100);
-/// How long a camera may take to say that it is there: with half, one of 0.3 s would seem absent.
+/// How long a camera may take to say that it is there. With half of it one that takes 0.3 s would
+/// seem absent.
 const FOUND_WITHIN: Duration = Duration::from_millis(500);
 /// How often the camera is asked what its clock shows. Quartz clocks drift apart by 50 us in a
 /// second: with ten times as long between questions, the line through the answers would follow a
-/// clock that warms up too late.
+/// clock that warms up too late. With half of it frames wait twice as often for an answer.
 const ASKED_EVERY: Duration = Duration::from_secs(1);
 /// Interval for a camera that does not answer: with half of it frames wait twice as often in vain.
 const ASKED_AGAIN: Duration = Duration::from_secs(10);
-/// An answer that took less than `QUICK` is good enough. One that took more than `SLOW` is
-/// discarded: it may be off by half of what it took. In between, the quickest of `TRIES` is used.
-/// With half of `SLOW` a camera that answers in 15 ms is timed by its arrivals.
-const QUICK: Duration = Duration::from_millis(1);
-const SLOW: Duration = Duration::from_millis(20);
-const TRIES: usize = 3;
 /// This host's clock was set if it moved by more than answers err by, s: earlier answers are then
 /// invalid. With half of it a step as small as an answer's error would reopen the camera.
 const HOST_SET_S: f64 = 0.02;
-/// A camera's clock within this of the host's is taken to show the same time, s; one that counts
+/// A camera's clock within this of the host's is assumed to show the same time, s; one that counts
 /// from when the camera was switched on is years off. With half of it the same.
 const SAME_TIME_S: f64 = 2.0;
 /// Possible times from a frame's stamp to its arrival, s: outside, the answers are of another
-/// clock. The lower end allows for half an answer's duration, the upper for a long exposure.
+/// clock. The lower end allows for half an answer's duration, the upper for a long exposure. With
+/// half of both, frames of slow answers or long exposures count as impossible.
 const POSSIBLE_S: std::ops::Range<f64> = -0.02..1.0;
 /// After this many impossible frames in a row the stamps are not believed: a stall holds back only
 /// sixteen. With half of it a stall would end the use of good stamps.
 const IMPOSSIBLE: u32 = 20;
-/// Names of the feature that tells whether the camera's clock follows another by PTP, and its value
-/// if so.
-const PTP: [&str; 2] = ["PtpStatus", "GevIEEE1588Status"];
-const FOLLOWS: &str = "Slave";
 /// Latency from the exposure to the arrival where nothing better is known: an image is read out and
-/// sent within a frame's interval.
+/// sent within a frame's interval. With half of it times by arrival are 20 ms later.
 const LATENCY: StreamLatency = StreamLatency { mean_s: 0.04, sd_s: 0.04 };
-/// Registers that every camera has, some in name only: ticks per second, the command that latches
-/// the time, and the latched time (GigE Vision 2.0, 28).
-const TICKS_AT: u64 = 0x93c;
-const LATCH_AT: u64 = 0x944;
-const LATCHED_AT: u64 = 0x948;
-const LATCH: [u8; 4] = 2_u32.to_be_bytes();
-/// Names of the same for cameras whose registers are empty (SFNC, and its names before 2.3).
-const LATCHES: [&str; 3] = ["TimestampLatch", "GevTimestampControlLatch", "TimestampControlLatch"];
-const LATCHED: [&str; 3] = ["TimestampLatchValue", "GevTimestampValue", "TimestampValue"];
-/// Ticks per second of clocks that do not say.
+/// Ticks per second of clocks that do not say: they count nanoseconds (GigE Vision 2.0). With half
+/// of it times would advance twice as fast.
 const NANOSECONDS: f64 = 1e9;
-/// Names of the exposure time, us; a value above a second is ignored: nothing is followed with it.
+/// Names of the exposure time, us.
 const EXPOSURES: [&str; 2] = ["ExposureTime", "ExposureTimeAbs"];
+/// Longest exposure, us; a longer one is ignored: nothing is followed with it. With half of it the
+/// same for exposures at two frames per second and more.
 const LONGEST_US: f64 = 1e6;
 
 /// Options for watching a GigE Vision camera.
@@ -85,7 +72,7 @@ pub struct GigeOptions {
     /// Frames per second; if `None`, the rate that it is set to.
     pub rate_hz: Option<f64>,
     /// Time from the middle of the exposure to the camera's time stamp, s. If `None`, the stamp is
-    /// taken as the start of the exposure, as in the standard (SFNC, `Timestamp`), and half the
+    /// used as the start of the exposure, as in the standard (SFNC, `Timestamp`), and half the
     /// exposure is added.
     pub latency_s: Option<f64>,
     /// Standard deviation of its frames' times, s.
@@ -173,12 +160,20 @@ struct GigeSource {
     exposure_s: f64,
     silence: Duration,
     is_silent: bool,
-    /// The camera's number of the block before, and that block's frame number.
-    before: Option<(u64, u64)>,
+    before: Option<NumberedBlock>,
     /// Number of incomplete frames reported so far, ...
     torn: u64,
     /// ... and the complete frame that came after them, until they are reported.
-    held: Option<Block>,
+    postponed: Option<Block>,
+}
+
+/// A block of the stream, by its numbers.
+#[derive(Clone, Copy, Debug)]
+struct NumberedBlock {
+    /// The camera's number of it.
+    block: u64,
+    /// The number of its frame.
+    index: u64,
 }
 
 impl GigeSource {
@@ -190,7 +185,8 @@ impl GigeSource {
             .map_err(wrong)?
             .ok_or_else(|| said("no GigE Vision camera answers there".to_owned()))?;
         // Where something is wrong, they are dropped from the last to the first.
-        let Connection { runtime, mut camera } = Connection::open(options.address).map_err(said)?;
+        let ControlledCamera { runtime, mut camera } =
+            ControlledCamera::open(options.address).map_err(said)?;
         if let Ok(mut device) = camera.transport().lock_device() {
             device.set_control_timeout(ANSWERED_WITHIN);
         }
@@ -219,7 +215,7 @@ impl GigeSource {
             is_silent: false,
             before: None,
             torn: 0,
-            held: None,
+            postponed: None,
         };
         source.ask();
         source.camera.acquisition_start().map_err(wrong)?;
@@ -243,11 +239,11 @@ impl GigeSource {
             return;
         }
         match latched(&mut self.camera) {
-            Some(Answer { ticks, at, took }) => {
+            Some(ClockAnswer { ticks, at, took }) => {
                 self.stamps = Some(Stamps::Own);
                 self.answer_sd_s = took.as_secs_f64() / 2.0;
-                let told = self.host.at(self.host.since_s(at));
-                self.clock.report(ticks as f64 / self.ticks_hz, told);
+                let shown = self.host.at(self.host.since_s(at));
+                self.clock.report(ticks as f64 / self.ticks_hz, shown);
             }
             None => self.ask_at = Instant::now() + ASKED_AGAIN,
         }
@@ -319,19 +315,20 @@ impl GigeSource {
 
     /// The number of a block's frame; those of frames that never came are left out.
     fn numbered(&mut self, block: u64) -> u64 {
-        /// Cameras of the first version count to 65535 and then start again from 1.
+        /// Cameras of the first version count to 65535 and then start again from 1. With half of it
+        /// the frame after 65535 would be numbered as if thousands were lost.
         const ROUND: u64 = 0xffff;
-        let index = self.before.map_or(0, |(before, index)| {
-            let is_round = block < ROUND / 2 && (ROUND / 2..=ROUND).contains(&before);
-            let steps = match block.checked_sub(before) {
+        let index = self.before.map_or(0, |before| {
+            let is_round = block < ROUND / 2 && (ROUND / 2..=ROUND).contains(&before.block);
+            let steps = match block.checked_sub(before.block) {
                 Some(steps) => steps,
-                None if is_round => block + ROUND - before,
+                None if is_round => block + ROUND - before.block,
                 // The camera's count has started again from elsewhere.
                 None => 1,
             };
-            index + steps.clamp(1, ROUND)
+            before.index + steps.clamp(1, ROUND)
         });
-        self.before = Some((block, index));
+        self.before = Some(NumberedBlock { block, index });
         index
     }
 
@@ -340,7 +337,7 @@ impl GigeSource {
         let torn = self.frames.stats().frames_incomplete;
         (torn > self.torn).then(|| {
             self.torn += 1;
-            let index = self.before.map_or(0, |(_, index)| index + 1);
+            let index = self.before.map_or(0, |before| before.index + 1);
             self.bad(index, "packets were lost on the way".to_owned())
         })
     }
@@ -351,14 +348,14 @@ impl FrameSource for GigeSource {
         if Instant::now() >= self.ask_at {
             self.ask();
         }
-        let next = match self.held.take() {
+        let next = match self.postponed.take() {
             Some(block) => Ok(Some(block)),
             None => self.frames.next_frame_blocking(self.silence),
         };
         self.is_silent = matches!(next, Err(GenicamError::Timeout(_)));
         if let Some(torn) = self.torn() {
             // Incomplete frames are reported one by one before the next complete one is handed on.
-            self.held = next.ok().flatten();
+            self.postponed = next.ok().flatten();
             return Err(torn);
         }
         let wrong = |what: String| VideoError::Stream { url: self.address.clone(), what };
@@ -417,67 +414,6 @@ fn set_up(camera: &mut Camera<GigeRegisterIo>, options: &GigeOptions) -> Result<
         camera.set_frame_rate(rate_hz)?;
     }
     Ok(())
-}
-
-/// The eight-byte number in the registers at an address.
-fn eight_bytes(camera: &Camera<GigeRegisterIo>, at: u64) -> Option<u64> {
-    let bytes = camera.transport().read(at, 8).ok()?;
-    Some(u64::from_be_bytes(bytes.try_into().ok()?))
-}
-
-/// The camera's clock when it was asked.
-struct Answer {
-    ticks: u64,
-    /// Midway between the question and its answer: off by half of their distance at most.
-    at: Instant,
-    took: Duration,
-}
-
-/// The quickest of several answers; `None` if the camera gives none, or none that is quick enough.
-fn latched(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
-    let mut quickest: Option<Answer> = None;
-    for _ in 0..TRIES {
-        let answer = latch(camera)?;
-        let took = answer.took;
-        if quickest.as_ref().is_none_or(|before| took < before.took) {
-            quickest = Some(answer);
-        }
-        if took < QUICK {
-            break;
-        }
-    }
-    quickest.filter(|answer| answer.took < SLOW)
-}
-
-/// Asks once, by the registers.
-fn latch(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
-    let sent = Instant::now();
-    let noted = camera.transport().write(LATCH_AT, &LATCH).ok().map(|()| sent.elapsed());
-    let by_register = noted.and_then(|took| {
-        let ticks = eight_bytes(camera, LATCHED_AT).filter(|ticks| *ticks != 0)?;
-        Some(Answer { ticks, at: sent + took / 2, took })
-    });
-    by_register.or_else(|| latch_by_name(camera))
-}
-
-/// The same for cameras that have the command under a name only.
-fn latch_by_name(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
-    let there = |name: &&&str| camera.nodemap().node(name).is_some();
-    let (command, value) = (LATCHES.iter().find(there)?, LATCHED.iter().find(there)?);
-    let sent = Instant::now();
-    camera.execute_command(command).ok()?;
-    let took = sent.elapsed();
-    camera.invalidate(value);
-    let ticks = u64::try_from(camera.get_integer(value).ok()?).ok()?;
-    Some(Answer { ticks, at: sent + took / 2, took })
-}
-
-/// Whether the camera's clock follows another by PTP.
-fn follows_another(camera: &mut Camera<GigeRegisterIo>) -> bool {
-    PTP.iter().any(|name| {
-        camera.invalidate(name);
-        camera.get_enum(name).is_ok_and(|status| status == FOLLOWS)
-    })
 }
 
 /// A block's pixels without the padding of its rows.

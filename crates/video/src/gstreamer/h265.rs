@@ -5,16 +5,16 @@ use gstreamer::prelude::*;
 use gstreamer::{Buffer, ClockTime, Pipeline, State};
 use gstreamer_app::{AppSink, AppSrc};
 
-use super::pipeline::{brightness, built, trouble};
-use crate::h264::Picture;
+use super::pipeline::{Brightness, brightness, built, trouble};
+use crate::h264::DecodedPicture;
 
 /// Access units in, pictures out. One thread, as each further thread holds back another picture.
 const DECODER: &str = "appsrc name=units format=time is-live=true \
                        caps=video/x-h265,stream-format=byte-stream,alignment=au ! h265parse ! \
                        avdec_h265 max-threads=1 max-errors=-1";
-/// A picture that has not come out after this time is taken as held back by the decoder: several
-/// times what decoding 4K takes. With half of it pictures of a busy host are taken as held back,
-/// and come a frame late; with twice as much a picture that is held back delays the first frames by
+/// A picture that has not come out after this time counts as held back by the decoder: several
+/// times what decoding 4K takes. With half of it pictures of a busy host count as held back, and
+/// come a frame late; with twice as much a picture that is held back delays the first frames by
 /// twice as long.
 const DECODED_WITHIN: Duration = Duration::from_millis(100);
 /// Most units whose pictures are waited for: H.265 allows 16 to be held back. With half of it every
@@ -52,7 +52,11 @@ impl H265Decoder {
 
     /// Decodes an access unit in Annex B; returns the pictures that have come out, of earlier units
     /// too.
-    pub(crate) fn decode(&mut self, unit: &[u8], shown_at: i64) -> Result<Vec<Picture>, String> {
+    pub(crate) fn decode(
+        &mut self,
+        unit: &[u8],
+        shown_at: i64,
+    ) -> Result<Vec<DecodedPicture>, String> {
         let since_first = shown_at.wrapping_sub(*self.first.get_or_insert(shown_at));
         let known = FIRST.nseconds().saturating_add_signed(since_first.saturating_mul(TICK_NS));
         let known = ClockTime::from_nseconds(known);
@@ -75,7 +79,7 @@ impl H265Decoder {
 
     /// All pictures that have come out. Waits for one if more units are pending than the decoder
     /// holds back; if none comes in time, all pending ones count as held back.
-    fn come_out(&mut self) -> Result<Vec<Picture>, String> {
+    fn come_out(&mut self) -> Result<Vec<DecodedPicture>, String> {
         let begun = Instant::now();
         let mut pictures = Vec::new();
         loop {
@@ -94,8 +98,8 @@ impl H265Decoder {
                 continue;
             };
             self.held_back = self.held_back.min(self.pending.len());
-            let (width, height, brightness) = brightness(&sample)?;
-            pictures.push(Picture { shown_at, width, height, brightness });
+            let Brightness { width, height, samples } = brightness(&sample)?;
+            pictures.push(DecodedPicture { shown_at, width, height, brightness: samples });
         }
     }
 }
@@ -164,15 +168,15 @@ mod tests {
         let (pipeline, sink) = ball("");
         let mut places = Vec::new();
         while let Ok(sample) = sink.pull_sample() {
-            let (width, _, pixels) = brightness(&sample).unwrap();
-            places.push(middle(width, &pixels));
+            let Brightness { width, samples, .. } = brightness(&sample).unwrap();
+            places.push(middle(width, &samples));
         }
         pipeline.set_state(State::Null).unwrap();
         places
     }
 
     /// Checks that a picture shows the ball where it was at the picture's time.
-    fn check(encoder: &str, picture: &Picture, truth: &[[f64; 2]]) {
+    fn check(encoder: &str, picture: &DecodedPicture, truth: &[[f64; 2]]) {
         assert_eq!((picture.width, picture.height), (322, 242));
         let number = (picture.shown_at / 3000) as usize;
         let place = middle(picture.width, &picture.brightness);

@@ -11,12 +11,12 @@ use crate::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock, unix_time}
 use crate::{Arrival, Frame, FrameSource, MOST_PIXELS, Pixels, TimedBy, VideoError};
 
 /// Ends every pipeline: brightness alone, handed over as soon as it is there. The caller takes each
-/// frame at once, and what a decoder holds is limited by what it was given.
+/// frame at once, and what a decoder keeps is limited by what it was given.
 const BRIGHTNESS: &str =
     "videoconvert ! video/x-raw,format=GRAY8 ! appsink name=brightness sync=false";
-/// Origin of a reference time, as GStreamer's streams name it: the start of NTP's count, or of
-/// Unix's.
+/// GStreamer's name of reference times from the start of NTP's count.
 const NTP: &str = "timestamp/x-ntp";
+/// GStreamer's name of reference times from the start of Unix's count.
 const UNIX: &str = "timestamp/x-unix";
 
 /// Builds the pipeline that is described, with the brightness sink at its end.
@@ -29,8 +29,15 @@ pub(super) fn built(description: &str) -> Result<(Pipeline, AppSink), String> {
     sink.map(|sink| (pipeline, sink)).ok_or_else(|| "it has no end".to_owned())
 }
 
-/// Columns, rows and brightness of a sample, without the padding of its rows.
-pub(super) fn brightness(sample: &Sample) -> Result<(usize, usize, Vec<u8>), String> {
+/// A picture's brightness, row by row.
+pub(super) struct Brightness {
+    pub(super) width: usize,
+    pub(super) height: usize,
+    pub(super) samples: Vec<u8>,
+}
+
+/// Brightness of a sample, without the padding of its rows.
+pub(super) fn brightness(sample: &Sample) -> Result<Brightness, String> {
     let caps = sample.caps().ok_or("a frame has no format")?;
     let info = VideoInfo::from_caps(caps).map_err(|error| error.to_string())?;
     let buffer = sample.buffer().ok_or("a frame is empty")?;
@@ -42,12 +49,12 @@ pub(super) fn brightness(sample: &Sample) -> Result<(usize, usize, Vec<u8>), Str
     }
     let rows = frame.plane_data(0).map_err(|error| error.to_string())?;
     let stride = usize::try_from(frame.plane_stride()[0]).unwrap_or(0).max(1);
-    let pixels: Vec<u8> =
+    let samples: Vec<u8> =
         rows.chunks(stride).take(height).flat_map(|row| row.iter().take(width)).copied().collect();
-    if pixels.len() != width * height {
+    if samples.len() != width * height {
         return Err("a frame is cut off".to_owned());
     }
-    Ok((width, height, pixels))
+    Ok(Brightness { width, height, samples })
 }
 
 /// The first error that a pipeline has reported, if any; messages of other kinds are discarded.
@@ -63,7 +70,7 @@ pub(super) fn trouble(pipeline: &Pipeline) -> Option<String> {
 }
 
 /// When a sample was captured by its reference time, which the pipeline has from the source.
-fn told(sample: &Sample) -> Option<Timestamp> {
+fn reference_time(sample: &Sample) -> Option<Timestamp> {
     let meta = sample.buffer()?.meta::<ReferenceTimestampMeta>()?;
     let nanos = meta.timestamp().nseconds();
     match meta.reference().structure(0)?.name().as_str() {
@@ -133,18 +140,18 @@ impl PipelineSource {
             index,
             what,
         });
-        let (width, height, pixels) = decoded?;
+        let Brightness { width, height, samples } = decoded?;
         let arrived_s = self.host.since_s(at);
         let count = sample.buffer().and_then(|buffer| buffer.pts());
-        let told = told(sample);
+        let by_source = reference_time(sample);
         // The pipeline's own count varies with the network's delays; the reference time does not.
-        let stream_s = match (told, count) {
-            (Some(told), _) => told.seconds(),
+        let stream_s = match (by_source, count) {
+            (Some(time), _) => time.seconds(),
             (None, Some(count)) => count.nseconds() as f64 * 1e-9,
             (None, None) => arrived_s,
         };
-        if let Some(told) = told {
-            self.clock.report(stream_s, told);
+        if let Some(time) = by_source {
+            self.clock.report(stream_s, time);
         }
         let (capture, timed_by) = self.clock.time(stream_s, arrived_s);
         let set_by_s = self.host.set_by_s(&HostClock::read());
@@ -152,7 +159,7 @@ impl PipelineSource {
             return Err(VideoError::HostClockSet { by_s: set_by_s });
         }
         let live = Some(Arrival { at, stream_s, timed_by });
-        Ok(Frame { index, capture, live, width, height, pixels: Pixels::Gray8(pixels) })
+        Ok(Frame { index, capture, live, width, height, pixels: Pixels::Gray8(samples) })
     }
 }
 

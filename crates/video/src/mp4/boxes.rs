@@ -1,7 +1,7 @@
 //! Filters an MP4 index down to the boxes that are read.
 //!
 //! `mp4-atom` reads every box that it knows wherever it meets it, nested without a limit, and
-//! allocates for some of them what they claim and not what their length allows. It is given only
+//! allocates for some of them what they state and not what their length allows. It is given only
 //! the boxes that are listed here, each where it belongs.
 
 use std::ops::Range;
@@ -10,51 +10,60 @@ use self::Holds::{Boxes, Counted, Picture, Values};
 
 /// A kind of box that is read, and its contents.
 #[derive(Clone, Copy)]
-pub(super) struct Known([u8; 4], Holds);
+pub(super) struct KnownBox([u8; 4], Holds);
 
 #[derive(Clone, Copy)]
 enum Holds {
     /// Values, which are kept as they are.
     Values,
     /// Boxes.
-    Boxes(&'static [Known]),
+    Boxes(&'static [KnownBox]),
     /// A version, the number of boxes, and the boxes.
-    Counted(&'static [Known]),
+    Counted(&'static [KnownBox]),
     /// A picture's description, and boxes.
-    Picture(&'static [Known]),
+    Picture(&'static [KnownBox]),
 }
 
 /// The boxes of a whole file's index.
-pub(super) const MOOV: &[Known] = &[
-    Known(*b"mvhd", Values),
-    Known(*b"mvex", Boxes(&[Known(*b"trex", Values)])),
-    Known(*b"trak", Boxes(&[Known(*b"tkhd", Values), Known(*b"mdia", Boxes(MDIA))])),
+pub(super) const MOOV: &[KnownBox] = &[
+    KnownBox(*b"mvhd", Values),
+    KnownBox(*b"mvex", Boxes(&[KnownBox(*b"trex", Values)])),
+    KnownBox(*b"trak", Boxes(&[KnownBox(*b"tkhd", Values), KnownBox(*b"mdia", Boxes(MDIA))])),
 ];
 
-const MDIA: &[Known] =
-    &[Known(*b"mdhd", Values), Known(*b"hdlr", Values), Known(*b"minf", Boxes(MINF))];
+/// The boxes of a track's media.
+const MDIA: &[KnownBox] =
+    &[KnownBox(*b"mdhd", Values), KnownBox(*b"hdlr", Values), KnownBox(*b"minf", Boxes(MINF))];
 
-/// Must contain the reference to its data (`dinf`), though the data are always in this file.
-const MINF: &[Known] =
-    &[Known(*b"dinf", Boxes(&[Known(*b"dref", Counted(&[]))])), Known(*b"stbl", Boxes(STBL))];
+/// The boxes of a track's tables. They must contain the reference to its data (`dinf`), though the
+/// data are always in this file.
+const MINF: &[KnownBox] = &[
+    KnownBox(*b"dinf", Boxes(&[KnownBox(*b"dref", Counted(&[]))])),
+    KnownBox(*b"stbl", Boxes(STBL)),
+];
 
-const STBL: &[Known] = &[
-    Known(*b"stsd", Counted(&[Known(*b"avc1", Picture(&[Known(*b"avcC", Values)]))])),
-    Known(*b"stts", Values),
-    Known(*b"ctts", Values),
-    Known(*b"stsc", Values),
-    Known(*b"stsz", Values),
-    Known(*b"stco", Values),
-    Known(*b"co64", Values),
-    Known(*b"stss", Values),
+/// The boxes of the tables of a track's frames.
+const STBL: &[KnownBox] = &[
+    KnownBox(*b"stsd", Counted(&[KnownBox(*b"avc1", Picture(&[KnownBox(*b"avcC", Values)]))])),
+    KnownBox(*b"stts", Values),
+    KnownBox(*b"ctts", Values),
+    KnownBox(*b"stsc", Values),
+    KnownBox(*b"stsz", Values),
+    KnownBox(*b"stco", Values),
+    KnownBox(*b"co64", Values),
+    KnownBox(*b"stss", Values),
 ];
 
 /// The boxes of a fragment's index.
-pub(super) const MOOF: &[Known] = &[
-    Known(*b"mfhd", Values),
-    Known(
+pub(super) const MOOF: &[KnownBox] = &[
+    KnownBox(*b"mfhd", Values),
+    KnownBox(
         *b"traf",
-        Boxes(&[Known(*b"tfhd", Values), Known(*b"tfdt", Values), Known(*b"trun", Values)]),
+        Boxes(&[
+            KnownBox(*b"tfhd", Values),
+            KnownBox(*b"tfdt", Values),
+            KnownBox(*b"trun", Values),
+        ]),
     ),
 ];
 
@@ -65,15 +74,16 @@ const PICTURE_BYTES: usize = 78;
 ///
 /// # Errors
 /// What is wrong with it, in words, if a box within it is cut off.
-pub(super) fn known(whole: &[u8], within: &'static [Known]) -> Result<Vec<u8>, String> {
+pub(super) fn known(whole: &[u8], within: &'static [KnownBox]) -> Result<Vec<u8>, String> {
     let First { kind, body, .. } = first(whole)?;
     let mut kept = Vec::with_capacity(whole.len());
-    append(Known(kind, Boxes(within)), body, &mut kept)?;
+    append(KnownBox(kind, Boxes(within)), body, &mut kept)?;
     Ok(kept)
 }
 
 /// Appends a box with only those parts that are read; its size is set to what was kept.
-fn append(Known(kind, holds): Known, body: &[u8], kept: &mut Vec<u8>) -> Result<(), String> {
+fn append(KnownBox(kind, holds): KnownBox, body: &[u8], kept: &mut Vec<u8>) -> Result<(), String> {
+    /// Place of the number of boxes, bytes: after the version (ISO/IEC 14496-12, 8.5.2).
     const COUNT: Range<usize> = 4..8;
     let begins = kept.len();
     kept.extend([0; 4]);
@@ -102,16 +112,17 @@ fn append(Known(kind, holds): Known, body: &[u8], kept: &mut Vec<u8>) -> Result<
 
 /// Appends those inner boxes that are read, and returns their number.
 fn append_within(
-    within: &'static [Known],
+    within: &'static [KnownBox],
     mut bytes: &[u8],
     kept: &mut Vec<u8>,
 ) -> Result<u32, String> {
-    /// Fewer bytes than a box's head are padding.
+    /// Length of a box's head, bytes: fewer are padding. With half of it padding of four bytes
+    /// would be read as a box that is cut off.
     const LEAST: usize = 8;
     let mut count = 0;
     while bytes.len() >= LEAST {
         let First { kind, body, rest } = first(bytes)?;
-        if let Some(&known) = within.iter().find(|Known(known, _)| *known == kind) {
+        if let Some(&known) = within.iter().find(|KnownBox(known, _)| *known == kind) {
             append(known, body, kept)?;
             count += 1;
         }

@@ -3,7 +3,7 @@
 //! The boxes are parsed by `mp4-atom`. It is given whole boxes in a buffer, so it cannot read
 //! beyond them, with nothing in them but what is read here; every loop here advances in the file or
 //! ends. So the time and memory that a damaged file costs grow with its size, and
-//! not with what it claims.
+//! not with what it states.
 
 use std::io::{Read, Seek, SeekFrom};
 
@@ -16,7 +16,7 @@ const MOST_INDEX_BYTES: u64 = 128 << 20;
 /// Most frames of a file: 19 hours at 60 per second. With half of it recordings of more than 9.7
 /// hours at that rate are refused.
 const MOST_SAMPLES: usize = 1 << 22;
-/// A compressed frame longer than this is taken for damage, bytes. With half of it the same.
+/// A compressed frame longer than this counts as damage, bytes. With half of it the same.
 const MOST_SAMPLE_BYTES: u64 = 64 << 20;
 
 /// One compressed frame.
@@ -125,7 +125,9 @@ fn head<R: Read + Seek>(
     at: u64,
     end: u64,
 ) -> std::io::Result<Option<([u8; 4], u64)>> {
+    /// Length of a box's head, bytes.
     const SHORT: u64 = 8;
+    /// Length of the head of a box that is longer than 4 GB, bytes.
     const LONG: u64 = 16;
     if end.saturating_sub(at) < SHORT {
         return Ok(None);
@@ -250,7 +252,7 @@ impl Samples {
         track: u32,
         usual: Option<&Trex>,
     ) -> Result<(), String> {
-        /// A frame that others are needed for.
+        /// Flag of a frame that others are needed for (ISO/IEC 14496-12, 8.8.3).
         const IS_NOT_SYNC: u32 = 1 << 16;
         for part in moof.traf.iter().filter(|part| part.tfhd.track_id == track) {
             let head = &part.tfhd;
@@ -281,7 +283,7 @@ impl Samples {
                     ]);
                     let shift = entry.cts.map_or(0, i64::from);
                     if !self.push(offset, size, flags & IS_NOT_SYNC == 0, shift, lasts)? {
-                        // What is left of the run lies beyond the end too, however many it claims.
+                        // What is left of the run lies beyond the end too, whatever its number.
                         self.missing = self.missing.saturating_add(run.samples.len() - done);
                         return Ok(());
                     }

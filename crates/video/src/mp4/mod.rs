@@ -7,7 +7,7 @@ use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use self::index::Sample;
-use crate::h264::{H264Decoder, Picture};
+use crate::h264::{DecodedPicture, H264Decoder};
 use crate::{Frame, FrameClock, FrameSource, Pixels, VideoError};
 
 /// An MP4 file with H.264, decoded to its brightness plane.
@@ -96,16 +96,18 @@ impl Mp4Source {
         }
     }
 
-    fn collect(&mut self, picture: Result<Picture, String>) {
+    fn collect(&mut self, picture: Result<DecodedPicture, String>) {
         match picture {
-            Ok(Picture { shown_at, width, height, brightness }) => self.ready.push_back(Frame {
-                index: 0,
-                capture: self.clock.at(shown_at as f64 / self.timescale),
-                live: None,
-                width,
-                height,
-                pixels: Pixels::Gray8(brightness),
-            }),
+            Ok(DecodedPicture { shown_at, width, height, brightness }) => {
+                self.ready.push_back(Frame {
+                    index: 0,
+                    capture: self.clock.at(shown_at as f64 / self.timescale),
+                    live: None,
+                    width,
+                    height,
+                    pixels: Pixels::Gray8(brightness),
+                });
+            }
             Err(what) => self.failed.push_back(what),
         }
     }

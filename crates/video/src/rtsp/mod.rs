@@ -23,12 +23,12 @@ pub use self::server::{RtspServer, ServedStream};
 
 #[cfg(feature = "gstreamer")]
 use crate::gstreamer::H265Decoder;
-use crate::h264::{H264Decoder, Picture};
+use crate::h264::{DecodedPicture, H264Decoder};
 use crate::live::SILENCE;
 use crate::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock, unix_time};
-use crate::{Arrival, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
+use crate::{Arrival, Frame, FrameSource, Still, TimedBy, VideoError, decode_still};
 
-/// Codecs that are decoded, as session descriptions name them.
+/// Codecs that are decoded, as session descriptions name them. A stream of another one is refused.
 const DECODED: &[&str] =
     if cfg!(feature = "gstreamer") { &["h264", "h265", "jpeg"] } else { &["h264", "jpeg"] };
 /// How long a camera may take to answer before it is given up. With half of it a camera that takes
@@ -40,7 +40,7 @@ const FAREWELL: Duration = Duration::from_millis(200);
 /// A slow stream may pause for this many times its longest recent interval. With half of it a slow
 /// stream counts as silent as soon as one frame is missing.
 const INTERVALS: u32 = 3;
-/// Number of recent intervals of which the longest is taken. With half of it a pause that comes
+/// Number of recent intervals of which the longest counts. With half of it a pause that comes
 /// with every sixth frame is forgotten before the next.
 const REMEMBERED_INTERVALS: usize = 8;
 /// A stream of which nothing could be decoded for this long is reopened: longer than the time
@@ -133,7 +133,7 @@ impl RtspCamera {
 
 /// A network camera's stream, H.264 or Motion JPEG, over RTSP, until it ends or falls silent.
 ///
-/// Capture times are by the camera's clock as its sender reports tell it (RFC 3550, 6.4.1), and by
+/// Capture times are by the camera's clock as its sender reports state it (RFC 3550, 6.4.1), and by
 /// arrival until the first report comes, which takes some seconds.
 pub struct RtspSource {
     runtime: Runtime,
@@ -163,8 +163,18 @@ pub struct RtspSource {
     ready: VecDeque<Frame>,
 }
 
-/// A picture's stream time, ticks, its columns, rows and pixels.
-type Decoded = (i64, usize, usize, Pixels);
+/// A picture that has come out of a decoder.
+struct Decoded {
+    /// Its stream time, ticks.
+    ticks: i64,
+    image: Still,
+}
+
+impl From<DecodedPicture> for Decoded {
+    fn from(picture: DecodedPicture) -> Self {
+        Self { ticks: picture.shown_at, image: picture.into_still() }
+    }
+}
 
 enum Codec {
     H264(Box<H264Decoder>),
@@ -198,7 +208,7 @@ impl RtspSource {
                 let _ = tokio::time::timeout(FAREWELL, sessions.await_teardown()).await;
             });
         }
-        let (stream, stream_id, codec) = connected?;
+        let Connection { stream, stream_id, codec } = connected?;
         let host = HostClock::read();
         Ok(Self {
             runtime,
@@ -246,18 +256,14 @@ impl RtspSource {
         let Some(stream) = &mut self.stream else {
             return Ok(None);
         };
+        let url = || self.url.clone();
         unharmed(&self.url, || {
-            let item = self
-                .runtime
-                .block_on(async { tokio::time::timeout(left, stream.next()).await })
-                .map_err(|_| VideoError::Silent {
-                    url: self.url.clone(),
-                    seconds: patience.as_secs_f64(),
-                })?;
-            item.transpose().map_err(|error| VideoError::Stream {
-                url: self.url.clone(),
-                what: first_line(&error.to_string()),
-            })
+            let item =
+                self.runtime.block_on(async { tokio::time::timeout(left, stream.next()).await });
+            let seconds = patience.as_secs_f64();
+            let item = item.map_err(|_| VideoError::Silent { url: url(), seconds })?;
+            let what = |error: retina::Error| first_line(&error.to_string());
+            item.transpose().map_err(|error| VideoError::Stream { url: url(), what: what(error) })
         })
     }
 
@@ -286,7 +292,7 @@ impl RtspSource {
     fn frame(
         &mut self,
         unit: &VideoFrame,
-        (ticks, width, height, pixels): Decoded,
+        Decoded { ticks, image }: Decoded,
         at: Instant,
     ) -> Result<Frame, VideoError> {
         let index = self.next;
@@ -301,6 +307,7 @@ impl RtspSource {
             return Err(VideoError::HostClockSet { by_s: set_by_s });
         }
         let live = Some(Arrival { at, stream_s, timed_by });
+        let Still { width, height, pixels } = image;
         Ok(Frame { index, capture, live, width, height, pixels })
     }
 
@@ -314,14 +321,15 @@ impl RtspSource {
             _ if self.torn => Err("packets were lost on the way".to_owned()),
             Codec::H264(decoder) => {
                 let picture = decoder.decode(unit.data(), ticks);
-                picture.map(|picture| picture.map(Picture::into_parts).into_iter().collect())
+                picture.map(|picture| picture.map(Decoded::from).into_iter().collect())
             }
             #[cfg(feature = "gstreamer")]
             Codec::H265(decoder) => decoder
                 .decode(unit.data(), ticks)
-                .map(|pictures| pictures.into_iter().map(Picture::into_parts).collect()),
-            Codec::MotionJpeg => decode_still(unit.data())
-                .map(|(width, height, pixels)| vec![(ticks, width, height, pixels)]),
+                .map(|pictures| pictures.into_iter().map(Decoded::from).collect()),
+            Codec::MotionJpeg => {
+                decode_still(unit.data()).map(|image| vec![Decoded { ticks, image }])
+            }
         };
         decoded.map_err(|what| {
             self.arrivals.remove(&ticks);
@@ -340,8 +348,8 @@ impl RtspSource {
         for report in reports.pkts() {
             if let Ok(Some(TypedPacketRef::SenderReport(report))) = report.as_typed() {
                 let stream_s = time.timestamp() as f64 / f64::from(time.clock_rate().get());
-                if let Some(told) = unix_time(report.ntp_timestamp().0) {
-                    self.clock.report(stream_s, told);
+                if let Some(shown) = unix_time(report.ntp_timestamp().0) {
+                    self.clock.report(stream_s, shown);
                 }
             }
         }
@@ -365,6 +373,15 @@ fn first_line(text: &str) -> String {
     text.lines().next().unwrap_or_default().to_owned()
 }
 
+/// What is wrong with a camera that offers only streams that are not decoded.
+fn no_codec(offered: &[String]) -> String {
+    format!(
+        "it offers no H.264 or Motion JPEG (it offers {}): set the camera to H.264, or build with \
+         --features gstreamer for H.265",
+        offered.join(", ")
+    )
+}
+
 /// What a camera's refusal means, in words for people.
 fn refusal(options: &RtspOptions, error: &retina::Error) -> VideoError {
     // What follows the `?` of an address may be a password, so it is replaced.
@@ -381,10 +398,18 @@ fn refusal(options: &RtspOptions, error: &retina::Error) -> VideoError {
     })
 }
 
+/// A stream that plays.
+struct Connection {
+    stream: Demuxed,
+    /// Its number in the session.
+    stream_id: usize,
+    codec: Codec,
+}
+
 async fn connect(
     options: &RtspOptions,
     sessions: &Arc<SessionGroup>,
-) -> Result<(Demuxed, usize, Codec), VideoError> {
+) -> Result<Connection, VideoError> {
     let credentials = options.login.as_ref().map(|login| Credentials {
         username: login.user().to_owned(),
         password: login.password().to_owned(),
@@ -406,13 +431,7 @@ async fn connect(
         .streams()
         .iter()
         .position(|stream| stream.media() == "video" && DECODED.contains(&stream.encoding_name()));
-    let stream_id = found.ok_or_else(|| {
-        options.wrong(format!(
-            "it offers no H.264 or Motion JPEG (it offers {}): set the camera to H.264, or build \
-             with --features gstreamer for H.265",
-            offered.join(", ")
-        ))
-    })?;
+    let stream_id = found.ok_or_else(|| options.wrong(no_codec(&offered)))?;
     let codec = match session.streams()[stream_id].encoding_name() {
         "h264" => {
             Codec::H264(Box::new(H264Decoder::of_stream().map_err(|what| options.wrong(what))?))
@@ -429,7 +448,7 @@ async fn connect(
     session.setup(stream_id, setup).await.map_err(refusal)?;
     let playing = session.play(PlayOptions::default()).await.map_err(refusal)?;
     let stream = playing.demuxed().map_err(refusal)?;
-    Ok((stream, stream_id, codec))
+    Ok(Connection { stream, stream_id, codec })
 }
 
 impl Drop for RtspSource {

@@ -8,11 +8,12 @@ use crate::stream_clock::NTP_TO_UNIX_S;
 /// The longest payload of a packet, bytes: that of an Ethernet frame. With half of it packets are
 /// twice as many.
 const LONGEST_PAYLOAD: usize = 1400;
-/// RTP payload type, as the session's description names it.
+/// RTP payload type, as the session's description names it: the first that is free to use (RFC
+/// 3551, 6).
 pub(super) const PAYLOAD_TYPE: u8 = 96;
-/// The clock of video streams, Hz.
+/// The clock of video streams, Hz (RFC 6184, 8.2.1).
 pub(super) const CLOCK_HZ: u32 = 90_000;
-/// Unit type of a fragment of a unit (FU-A).
+/// Unit type of a fragment of a unit (FU-A; RFC 6184, 5.8).
 const FRAGMENT: u8 = 28;
 
 /// Makes numbered packets of one stream.
@@ -51,8 +52,8 @@ impl Packetiser {
 
     /// A report of what the camera's clock shows when the stream's count is at `ticks`, on channel
     /// 1.
-    pub(super) fn report(&self, told: Timestamp, ticks: u32) -> Vec<u8> {
-        let nanos = told.nanos().max(0) as u64;
+    pub(super) fn report(&self, shown: Timestamp, ticks: u32) -> Vec<u8> {
+        let nanos = shown.nanos().max(0) as u64;
         let seconds = nanos / 1_000_000_000 + NTP_TO_UNIX_S;
         // NTP counts fractions of a second in steps of 2^-32 s.
         let fraction = (((nanos % 1_000_000_000) as u128) << 32) / 1_000_000_000;

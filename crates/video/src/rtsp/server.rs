@@ -19,20 +19,20 @@ const WAITING: usize = 64;
 /// How long a watcher may take no data before it is disconnected. With half of it the same at 30
 /// frames per second, where the queue is full after two seconds.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// The longest line, bytes, and the most lines of a request. With half of either the same: requests
-/// have some ten short lines.
+/// The longest line of a request, bytes. With half of it the same: requests have short lines.
 const LONGEST_LINE: u64 = 4096;
+/// The most lines of a request. With half of it the same: requests have some ten.
 const MOST_LINES: usize = 64;
 /// The session's name. Each watcher has a connection of its own, so all can have the same.
 const SESSION: &str = "1";
 
 /// The streams of a server, by path.
-type Streams = Arc<Mutex<BTreeMap<String, Arc<Mutex<Stream>>>>>;
+type Streams = Arc<Mutex<BTreeMap<String, Arc<Mutex<StreamState>>>>>;
 
 /// Serves H.264 streams as a network camera does: RTSP, with the packets within the connection.
 ///
-/// For scenes and tests. The server does not make the pictures: the holder of a stream's [`ServedStream`]
-/// sends each at its time.
+/// For scenes and tests. The server does not make the pictures: the holder of a stream's
+/// [`ServedStream`] sends each at its time.
 ///
 /// ```
 /// use crossfix_video::RtspServer;
@@ -51,10 +51,10 @@ pub struct RtspServer {
 
 /// A stream of a server, to send frames to.
 #[derive(Debug)]
-pub struct ServedStream(Arc<Mutex<Stream>>);
+pub struct ServedStream(Arc<Mutex<StreamState>>);
 
 #[derive(Debug)]
-struct Stream {
+struct StreamState {
     packetiser: Packetiser,
     watchers: Vec<Watcher>,
 }
@@ -101,7 +101,7 @@ impl RtspServer {
     pub fn mount(&mut self, path: &str) -> ServedStream {
         let source = locked(&self.streams).len() as u32 + 1;
         let packetiser = Packetiser::new(source);
-        let stream = Arc::new(Mutex::new(Stream { packetiser, watchers: Vec::new() }));
+        let stream = Arc::new(Mutex::new(StreamState { packetiser, watchers: Vec::new() }));
         locked(&self.streams).insert(path.to_owned(), Arc::clone(&stream));
         ServedStream(stream)
     }
@@ -125,10 +125,10 @@ impl ServedStream {
         });
     }
 
-    /// Tells all who watch what the camera's clock shows when the count is at `ticks`.
-    pub fn report(&self, told: Timestamp, ticks: u32) {
+    /// Reports to all who watch what the camera's clock has `shown` when the count was at `ticks`.
+    pub fn report(&self, shown: Timestamp, ticks: u32) {
         let mut stream = locked(&self.0);
-        let report = stream.packetiser.report(told, ticks);
+        let report = stream.packetiser.report(shown, ticks);
         stream.watchers.retain_mut(|watcher| !watcher.sees || watcher.send(report.clone()));
     }
 
@@ -234,7 +234,7 @@ impl Caller {
     }
 
     /// The path that a URL names, and its stream.
-    fn stream(&self, url: &str) -> Option<(String, Arc<Mutex<Stream>>)> {
+    fn stream(&self, url: &str) -> Option<(String, Arc<Mutex<StreamState>>)> {
         let path = url.split_once("://").map_or(url, |(_, rest)| rest);
         let path = path.split_once('/').map_or("", |(_, path)| path);
         let path = path.trim_end_matches("/video").trim_end_matches('/');

@@ -15,25 +15,36 @@ use nix::poll::{PollFd, PollFlags, poll};
 use nix::time::{ClockId, clock_gettime};
 
 use super::UsbOptions;
-use crate::{Arrival, CaptureTime, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
+use crate::{
+    Arrival, CaptureTime, Frame, FrameSource, Pixels, Still, TimedBy, VideoError, decode_still,
+};
 
 /// Number of buffers that the driver fills in turn: with one it could not fill the next while this
 /// one is read. With half of it a program that is late by one interval loses a frame.
 const BUFFERS: usize = 4;
-/// Pixel formats that are read, in order of preference: those without loss first.
+/// Pixel formats that are read, in order of preference: those without loss first. A camera that has
+/// none of them is refused.
 const FORMATS: [FourCc; 3] = [FourCc::Grey, FourCc::Yuyv, FourCc::Mjpeg];
 /// Frame rate that is requested to get all frames, Hz: drivers take the nearest that they have.
 /// With half of it the same for cameras below 500 Hz.
 const FASTEST_HZ: f64 = 1000.0;
 /// Least share of the requested rate that counts as that rate: 29.97 is 30. With half of it a
-/// format with 15 frames per second would be taken where 30 are requested.
+/// format with 15 frames per second would be chosen where 30 are requested.
 const LEAST_RATE: f64 = 0.97;
 
-/// Flags of a buffer (videodev2.h): it is damaged; its time is by `CLOCK_MONOTONIC`; its time is
-/// that of the start of the exposure, and not of the frame's end. The last two are (mask, value).
+/// Some of the flags of a buffer (videodev2.h), and what they are if a condition is true.
+#[derive(Clone, Copy)]
+struct FlagField {
+    mask: u32,
+    value: u32,
+}
+
+/// Flag of a buffer that is damaged (videodev2.h: `V4L2_BUF_FLAG_ERROR`).
 const DAMAGED: u32 = 0x40;
-const MONOTONIC: (u32, u32) = (0xe000, 0x2000);
-const START_OF_EXPOSURE: (u32, u32) = (0x7_0000, 0x1_0000);
+/// The buffer's time is by `CLOCK_MONOTONIC`.
+const MONOTONIC: FlagField = FlagField { mask: 0xe000, value: 0x2000 };
+/// The buffer's time is that of the start of the exposure, and not of the frame's end.
+const START_OF_EXPOSURE: FlagField = FlagField { mask: 0x7_0000, value: 0x1_0000 };
 
 /// The frames of a camera of this host, until it is unplugged or falls silent.
 ///
@@ -119,7 +130,7 @@ impl UsbSource {
 
     /// When a frame was captured, and the driver's time of it, s.
     fn capture(&self, filled: &Filled<'_>) -> (CaptureTime, f64) {
-        let is = |(mask, value): (u32, u32)| filled.flags & mask == value;
+        let is = |field: FlagField| filled.flags & field.mask == field.value;
         let wall_s = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
         let now_s = clock_gettime(ClockId::CLOCK_MONOTONIC)
             .map_or(0.0, |now| Duration::from(now).as_secs_f64());
@@ -169,7 +180,7 @@ fn opening(error: &std::io::Error) -> String {
     match error.kind() {
         std::io::ErrorKind::NotFound => "there is no such device: is the camera plugged in?".into(),
         std::io::ErrorKind::PermissionDenied => {
-            "this user may not watch it: `sudo usermod -aG video $USER`, and log in anew".into()
+            "this user may not watch it: `sudo usermod -aG video $USER`, and log in again".into()
         }
         std::io::ErrorKind::ResourceBusy => "another program is watching it".into(),
         _ if error.raw_os_error() == Some(Errno::ENODEV as i32) => "it was unplugged".into(),
@@ -178,7 +189,7 @@ fn opening(error: &std::io::Error) -> String {
 }
 
 /// Sets the camera to the requested size, in the first format that has the requested rate. If no
-/// rate is requested, the format with the highest rate is taken. Returns the format and the
+/// rate is requested, the format with the highest rate is chosen. Returns the format and the
 /// interval between frames, s.
 fn choose(device: &Device, options: &UsbOptions) -> Result<(PixFormat, f64), String> {
     let size = match options.size {
@@ -295,8 +306,8 @@ fn pixels(format: &PixFormat, bytes: &[u8]) -> Result<Pixels, String> {
         // YUYV: every other byte is brightness.
         FourCc::Yuyv => rows(bytes, [width, height], stride, 2).map(Pixels::Gray8),
         _ => match decode_still(bytes)? {
-            (columns, lines, pixels) if (columns, lines) == (width, height) => Ok(pixels),
-            (columns, lines, _) => Err(format!("its size is {columns}x{lines}")),
+            image if (image.width, image.height) == (width, height) => Ok(image.pixels),
+            Still { width, height, .. } => Err(format!("its size is {width}x{height}")),
         },
     }
 }

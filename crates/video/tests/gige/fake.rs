@@ -1,5 +1,5 @@
-//! A GigE Vision camera in this process, for tests: control (GVCP), an XML of what it has, and images
-//! (GVSP), as far as somebody who watches it uses them (GigE Vision 2.0, 11 to 24).
+//! A GigE Vision camera in this process, for tests: control (GVCP), an XML of what it has, and
+//! images (GVSP), as far as somebody who watches it uses them (GigE Vision 2.0, 11 to 24).
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket};

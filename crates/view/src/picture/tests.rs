@@ -4,11 +4,11 @@ use rerun::RecordingStreamBuilder;
 
 use super::*;
 
-fn picture() -> Picture {
-    Picture::new(RecordingStreamBuilder::new("test").memory().unwrap().0).unwrap()
+fn picture() -> SitePicture {
+    SitePicture::new(RecordingStreamBuilder::new("test").memory().unwrap().0).unwrap()
 }
 
-fn tell(picture: &mut Picture, channel: &Channel, arrival_s: f64, data: &[u8]) {
+fn deliver(picture: &mut SitePicture, channel: &Channel, arrival_s: f64, data: &[u8]) {
     assert!(picture.show(channel, Timestamp::from_seconds(arrival_s), data).unwrap().is_none());
 }
 
@@ -34,13 +34,13 @@ fn bearings(time_s: f64) -> Vec<u8> {
 fn tracks_of_a_fusion_centre_that_is_gone_are_not_drawn_for_ever() {
     let mut picture = picture();
     let north = Channel::Bearings("north".parse().unwrap());
-    tell(&mut picture, &Channel::Tracks, 100.0, &track(10.0));
-    tell(&mut picture, &north, 102.0, &bearings(12.0));
+    deliver(&mut picture, &Channel::Tracks, 100.0, &track(10.0));
+    deliver(&mut picture, &north, 102.0, &bearings(12.0));
     assert_eq!(picture.drawn.len(), 1, "it may only be late");
-    tell(&mut picture, &north, 104.0, &bearings(14.0));
+    deliver(&mut picture, &north, 104.0, &bearings(14.0));
     assert!(picture.drawn.is_empty() && picture.trails.is_empty());
     // The same where no message comes at all.
-    tell(&mut picture, &Channel::Tracks, 105.0, &track(15.0));
+    deliver(&mut picture, &Channel::Tracks, 105.0, &track(15.0));
     picture.clear_silent(Timestamp::from_seconds(109.0)).unwrap();
     assert!(picture.drawn.is_empty());
 }
@@ -49,11 +49,11 @@ fn tracks_of_a_fusion_centre_that_is_gone_are_not_drawn_for_ever() {
 fn neither_a_clock_from_the_future_nor_tracks_made_later_are_ghosts() {
     let mut picture = picture();
     let north = Channel::Bearings("north".parse().unwrap());
-    tell(&mut picture, &Channel::Tracks, 100.0, &track(10.0));
-    tell(&mut picture, &north, 100.1, &bearings(1e6));
+    deliver(&mut picture, &Channel::Tracks, 100.0, &track(10.0));
+    deliver(&mut picture, &north, 100.1, &bearings(1e6));
     assert_eq!(picture.drawn.len(), 1, "a camera's clock is wrong");
     // Tracks that were fused long after the recording.
-    tell(&mut picture, &north, 1.79e9, &bearings(10.1));
+    deliver(&mut picture, &north, 1.79e9, &bearings(10.1));
     assert_eq!(picture.drawn.len(), 1);
 }
 
@@ -74,7 +74,7 @@ fn a_camera_on_a_mount_is_drawn_as_its_last_frame_says() {
     let camera = Camera::new(lens, rest).unwrap();
     let message =
         CameraCalibration::new(&name, &camera, Timestamp::EPOCH).on_mount(&mount).encode();
-    tell(&mut picture, &Channel::Calibration(name.clone()), 1.0, &message);
+    deliver(&mut picture, &Channel::Calibration(name.clone()), 1.0, &message);
     let mut look = |azimuth: f64, time_s: f64| {
         let frame = BearingFrame {
             camera: name.to_string(),
@@ -82,9 +82,9 @@ fn a_camera_on_a_mount_is_drawn_as_its_last_frame_says() {
             pointing: Some(Pointing { azimuth, ..Default::default() }),
             ..Default::default()
         };
-        tell(&mut picture, &Channel::Bearings(name.clone()), time_s, &frame.encode());
+        deliver(&mut picture, &Channel::Bearings(name.clone()), time_s, &frame.encode());
         // The calibration is repeated; it does not turn the camera back.
-        tell(&mut picture, &Channel::Calibration(name.clone()), time_s, &message);
+        deliver(&mut picture, &Channel::Calibration(name.clone()), time_s, &message);
         picture.cameras["north"].camera.pose().rotation() * Vector3::z()
     };
     // West is to the left of north.

@@ -28,6 +28,7 @@ struct TargetModel {
     most_scale_ratio: f64,
 }
 
+/// The model in use; what half of each number does is said at its field.
 const TARGET: TargetModel = TargetModel {
     makes_plot: 0.8,
     in_gate: 0.999,
@@ -36,12 +37,12 @@ const TARGET: TargetModel = TargetModel {
     most_scale_ratio: 2.5,
 };
 
-/// How much the places of a candidate's plots may tell, as log likelihood ratios.
+/// How much the places of a candidate's plots may count, as log likelihood ratios.
 struct MotionEvidence {
-    /// Most that one plot tells: an empty corner of the clutter map is not known to be empty. With
+    /// Most that one plot counts: an empty corner of the clutter map is not known to be empty. With
     /// half of it a target in an empty sky needs up to twice as many plots.
     most_of_plot: f64,
-    /// Most that the plots of a candidate that keeps to its place tell together: what comes and
+    /// Most that the plots of a candidate that keeps to its place count together: what comes and
     /// goes in one place, as a branch in the wind, makes as many plots as a target. With half of it
     /// there are 0.4 and 1.5 false tracks per minute (thermal, visible) instead of 1.1 and 3.1, but
     /// what a shaken camera sees in noise is found in 76 % of the images instead of 89; with twice
@@ -59,6 +60,7 @@ struct MotionEvidence {
     most_places: f64,
 }
 
+/// The limits in use; what half of each number does is said at its field.
 const MOTION: MotionEvidence = MotionEvidence {
     most_of_plot: 4.0,
     most_in_place: 8.0,
@@ -67,7 +69,7 @@ const MOTION: MotionEvidence = MotionEvidence {
     most_places: 10.0,
 };
 
-/// How much the strength of a candidate's plots tells.
+/// How much the strength of a candidate's plots counts.
 struct StrengthEvidence {
     /// Decay length of the scene's own changes, which fall off exponentially with their size, in
     /// units of the texture: compressed video has more large ones than a normal distribution. With
@@ -79,7 +81,7 @@ struct StrengthEvidence {
     /// without targets. With half of it chance passes for a target up to 3.5 times (`e^1.25`) as
     /// often.
     density_constant: f64,
-    /// Most that the strength tells, nats. With half of it the strongest target needs two plots
+    /// Most that the strength counts, nats. With half of it the strongest target needs two plots
     /// more, of [`MotionEvidence::most_of_plot`] each.
     most: f64,
     /// Least variance of the noise in a mean over many images, spreads^2: plots are the part of the
@@ -87,6 +89,7 @@ struct StrengthEvidence {
     least_noise: f64,
 }
 
+/// The numbers in use; what half of each does is said at its field.
 const STRENGTH: StrengthEvidence =
     StrengthEvidence { tail: 1.5, density_constant: 2.5, most: 10.0, least_noise: 0.5 };
 
@@ -104,6 +107,7 @@ struct Kept {
     most: usize,
 }
 
+/// The limits in use; what half of each does is said at its field.
 const KEPT: Kept = Kept { least_log_ratio: -2.0, unseen_s: 0.4, most: 400 };
 
 /// How clutter is counted, in cells of the image.
@@ -119,6 +123,7 @@ struct ClutterModel {
     least: f64,
 }
 
+/// The map in use; what half of each number does is said at its field.
 const CLUTTER: ClutterModel = ClutterModel { cell_px: 32.0, mean_s: 3.0, least: 1e-4 };
 
 /// A track of plots that may be a target.
@@ -170,10 +175,10 @@ impl Candidate {
     pub(super) fn log_ratio(&self) -> f64 {
         let persistence = f64::from(self.plot.persistence);
         // n images of noise with persistence p are worth n (1 - p) / (1 + p) independent ones.
-        let looks = f64::from(self.plots) * (1.0 - persistence) / (1.0 + persistence);
-        // Variance of the mean excess, in spreads^2: noise averages out over the looks, texture
-        // over the parts of the scene.
-        let noise = (1.0 / looks.max(1.0)).max(STRENGTH.least_noise);
+        let independent = f64::from(self.plots) * (1.0 - persistence) / (1.0 + persistence);
+        // Variance of the mean excess, in spreads^2: noise averages out over the independent
+        // images, texture over the parts of the scene.
+        let noise = (1.0 / independent.max(1.0)).max(STRENGTH.least_noise);
         let texture = f64::from(self.plot.texture).powi(2) / self.parts();
         // s / tail - ln s is least at s = tail, and would rise again below it.
         let standing = (self.mean_excess / (texture + noise).sqrt()).max(STRENGTH.tail);
@@ -184,18 +189,15 @@ impl Candidate {
                 .min(STRENGTH.most)
     }
 
-    /// Squared Mahalanobis distance of a plot's place, and the determinant of the innovation's
-    /// covariance.
-    fn distance(&self, plot: &Plot, place: [f64; 2]) -> (f64, f64) {
+    fn innovation(&self, plot: &Plot, place: [f64; 2]) -> PlotInnovation {
         let variance = plot.variance();
-        let axes = self.axes.iter().zip(place);
-        axes.fold((0.0, 1.0), |(distance, determinant), (axis, position)| {
+        let mut both = PlotInnovation { squared: 0.0, determinant: 1.0 };
+        for (axis, position) in self.axes.iter().zip(place) {
             let innovation = axis.innovation(AxisMeasurement { position, variance });
-            (
-                distance + innovation.normalised_squared(),
-                determinant * (axis.position_variance() + variance),
-            )
-        })
+            both.squared += innovation.normalised_squared();
+            both.determinant *= axis.position_variance() + variance;
+        }
+        both
     }
 
     fn may_make(&self, plot: &Plot) -> bool {
@@ -203,19 +205,20 @@ impl Candidate {
         self.plot.is_brighter == plot.is_brighter && scales <= TARGET.most_scale_ratio
     }
 
-    /// Updates with a plot; `chance` is the density of clutter, 1/px^2.
-    fn take(&mut self, plot: Plot, place: [f64; 2], distance: f64, determinant: f64, chance: f64) {
+    /// Updates with a plot; `clutter` is the density of clutter there, 1/px^2.
+    fn take(&mut self, plot: Plot, place: [f64; 2], innovation: PlotInnovation, clutter: f64) {
         for (axis, position) in self.axes.iter_mut().zip(place) {
             axis.measurement_update(AxisMeasurement { position, variance: plot.variance() });
         }
         let off = [0, 1].map(|i| self.axes[i].position() - self.first[i]);
         self.gone_px = self.gone_px.max(off[0].hypot(off[1]));
         // ln (P_D N(innovation; 0, S) / clutter), with P_D the probability of a plot.
-        let there = -0.5 * distance - (std::f64::consts::TAU * determinant.sqrt()).ln();
-        let told = (TARGET.makes_plot.ln() + there - chance.ln()).min(MOTION.most_of_plot);
+        let PlotInnovation { squared, determinant } = innovation;
+        let there = -0.5 * squared - (std::f64::consts::TAU * determinant.sqrt()).ln();
+        let log_ratio = (TARGET.makes_plot.ln() + there - clutter.ln()).min(MOTION.most_of_plot);
         // The bound grows by 1 with each further part of the scene, and is higher where noise does
         // not last.
-        self.motion_log_ratio = (self.motion_log_ratio + told).min(
+        self.motion_log_ratio = (self.motion_log_ratio + log_ratio).min(
             MOTION.most_in_place
                 + MOTION.more_in_noise * (1.0 - f64::from(plot.persistence))
                 + self.parts()
@@ -229,6 +232,15 @@ impl Candidate {
     }
 }
 
+/// Innovation of a plot's place on both axes.
+#[derive(Clone, Copy, Debug)]
+struct PlotInnovation {
+    /// Squared Mahalanobis distance.
+    squared: f64,
+    /// Determinant of the innovation's covariance, px^4.
+    determinant: f64,
+}
+
 /// Map of clutter: plots that no candidate explains.
 #[derive(Debug, Default)]
 struct Clutter {
@@ -237,7 +249,7 @@ struct Clutter {
     means: Vec<f64>,
     counts: Vec<f64>,
     /// Rate of such plots, 1/min.
-    a_minute: f64,
+    per_minute: f64,
 }
 
 impl Clutter {
@@ -261,7 +273,7 @@ impl Clutter {
                 columns,
                 means: vec![mean; columns * rows],
                 counts: Vec::new(),
-                a_minute: 0.0,
+                per_minute: 0.0,
             };
         }
         self.counts.clear();
@@ -273,8 +285,8 @@ impl Clutter {
         for (mean, count) in self.means.iter_mut().zip(&self.counts) {
             *mean = (*mean + share * (count - *mean)).max(CLUTTER.least);
         }
-        let a_minute = self.counts.iter().sum::<f64>() * 60.0 / interval;
-        self.a_minute += share * (a_minute - self.a_minute);
+        let per_minute = self.counts.iter().sum::<f64>() * 60.0 / interval;
+        self.per_minute += share * (per_minute - self.per_minute);
     }
 }
 
@@ -287,9 +299,9 @@ pub(super) struct Candidates {
 }
 
 impl Candidates {
-    /// Rate of plots that no candidate explained, 1/min: so often chance may begin a candidate.
-    pub(super) fn chances_a_minute(&self) -> f64 {
-        self.clutter.a_minute
+    /// Rate of plots that no candidate explained, 1/min: how often chance may begin a candidate.
+    pub(super) fn chances_per_minute(&self) -> f64 {
+        self.clutter.per_minute
     }
 
     /// Associates the plots of the next image: each candidate takes the nearest free plot in its
@@ -313,20 +325,15 @@ impl Candidates {
                 .iter()
                 .enumerate()
                 .filter(|(index, plot)| is_free[*index] && candidate.may_make(plot));
-            let distances =
-                near.map(|(index, plot)| (index, candidate.distance(plot, in_scene(plot))));
-            let held = distances.filter(|(_, (distance, _))| gate.holds(*distance));
-            match held.min_by(|(_, (one, _)), (_, (other, _))| one.total_cmp(other)) {
-                Some((index, (distance, determinant))) => {
+            let innovations =
+                near.map(|(index, plot)| (index, candidate.innovation(plot, in_scene(plot))));
+            let in_gate = innovations.filter(|(_, innovation)| gate.holds(innovation.squared));
+            match in_gate.min_by(|(_, one), (_, other)| one.squared.total_cmp(&other.squared)) {
+                Some((index, innovation)) => {
                     is_free[index] = false;
                     let plot = plots[index];
-                    candidate.take(
-                        plot,
-                        in_scene(&plot),
-                        distance,
-                        determinant,
-                        self.clutter.density(plot.place),
-                    );
+                    let clutter = self.clutter.density(plot.place);
+                    candidate.take(plot, in_scene(&plot), innovation, clutter);
                 }
                 None => {
                     // ln (1 - P_D).
@@ -348,8 +355,8 @@ impl Candidates {
         self.list.truncate(KEPT.most);
     }
 
-    /// Removes the candidates that pass, and returns them.
-    pub(super) fn take_if(&mut self, passes: impl Fn(&Candidate) -> bool) -> Vec<Candidate> {
-        self.list.extract_if(.., |candidate| passes(candidate)).collect()
+    /// Removes the candidates of which a condition is true, and returns them.
+    pub(super) fn take_if(&mut self, is_wanted: impl Fn(&Candidate) -> bool) -> Vec<Candidate> {
+        self.list.extract_if(.., |candidate| is_wanted(candidate)).collect()
     }
 }

@@ -7,7 +7,7 @@ use pulp::Arch;
 /// three. With half of it a target of three cells is 36 % of its own surroundings instead of 11,
 /// and stands out by that much less.
 pub(super) const SURROUNDINGS: usize = 4;
-/// Side of the surroundings, cells.
+/// Side of the surroundings, cells: the cell's own and `SURROUNDINGS` on either side.
 const SIDE: usize = 2 * SURROUNDINGS + 1;
 
 /// Means of two by two; an odd last row or column is left out.
@@ -25,7 +25,7 @@ pub(super) fn halve(from: &Plane, to: &mut Plane) {
 
 /// Memory for [`stand_out`].
 #[derive(Debug, Default)]
-pub(super) struct Lines {
+pub(super) struct StandOutScratch {
     /// Sums down the columns of the surroundings.
     sums: Vec<f32>,
     /// One row, smoothed down the columns.
@@ -36,12 +36,12 @@ pub(super) struct Lines {
 
 /// Fills `to` with how much brighter each cell, smoothed by a quarter, a half and a quarter of its
 /// neighbours, is than the square about it; beyond the border the border cells are repeated.
-pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
+pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut StandOutScratch) {
     let (width, height) = (from.width(), from.height());
     to.reshape(width, height);
     let reach = SURROUNDINGS as isize;
     let row = |y: isize| from.row(y.clamp(0, height as isize - 1) as usize);
-    let Lines { sums, smoothed, means } = lines;
+    let StandOutScratch { sums, smoothed, means } = lines;
     for line in [&mut *sums, &mut *smoothed, &mut *means] {
         line.clear();
         line.resize(width, 0.0);
@@ -52,27 +52,36 @@ pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
     }
     Arch::new().dispatch(|| {
         for y in 0..height as isize {
-            let rows = row(y - 1).iter().zip(row(y)).zip(row(y + 1));
-            for (out, ((above, here), below)) in smoothed.iter_mut().zip(rows) {
-                *out = 0.25 * above + 0.5 * here + 0.25 * below;
-            }
+            smooth_across([row(y - 1), row(y), row(y + 1)], smoothed);
             means_along(sums, means);
-            let out = to.row_mut(y as usize);
-            for (out, (near, mean)) in out[1..].iter_mut().zip(smoothed.windows(3).zip(&means[1..]))
-            {
-                *out = 0.25 * near[0] + 0.5 * near[1] + 0.25 * near[2] - mean;
-            }
-            // At the ends the border is repeated: the missing neighbour's weight is added to the
-            // border's own.
-            let last = width - 1;
-            out[0] = 0.75 * smoothed[0] + 0.25 * smoothed[1.min(last)] - means[0];
-            out[last] =
-                0.75 * smoothed[last] + 0.25 * smoothed[last.saturating_sub(1)] - means[last];
+            smooth_less_means(smoothed, means, to.row_mut(y as usize));
             // The square moves a row down: the next row comes in, the last goes out.
             let ends = row(y + reach + 1).iter().zip(row(y - reach));
             sums.iter_mut().zip(ends).for_each(|(sum, (next, last))| *sum += next - last);
         }
     });
+}
+
+/// Smooths down the columns of three rows.
+#[inline(always)]
+fn smooth_across([above, here, below]: [&[f32]; 3], smoothed: &mut [f32]) {
+    let rows = above.iter().zip(here).zip(below);
+    for (out, ((above, here), below)) in smoothed.iter_mut().zip(rows) {
+        *out = 0.25 * above + 0.5 * here + 0.25 * below;
+    }
+}
+
+/// Smooths along a row, and subtracts the means of the surroundings.
+#[inline(always)]
+fn smooth_less_means(row: &[f32], means: &[f32], out: &mut [f32]) {
+    for (out, (near, mean)) in out[1..].iter_mut().zip(row.windows(3).zip(&means[1..])) {
+        *out = 0.25 * near[0] + 0.5 * near[1] + 0.25 * near[2] - mean;
+    }
+    // At the ends the border is repeated: the missing neighbour's weight is added to the border's
+    // own.
+    let last = row.len() - 1;
+    out[0] = 0.75 * row[0] + 0.25 * row[1.min(last)] - means[0];
+    out[last] = 0.75 * row[last] + 0.25 * row[last.saturating_sub(1)] - means[last];
 }
 
 /// Means of the surroundings along a row, from the sums down the columns.
@@ -152,13 +161,13 @@ mod tests {
             if (19..=21).contains(&x) && (14..=16).contains(&y) { 81.0 } else { 0.0 }
         });
         let mut to = Plane::default();
-        stand_out(&from, &mut to, &mut Lines::default());
+        stand_out(&from, &mut to, &mut StandOutScratch::default());
         // The middle has 81 less nine cells of 81 of the square of 81 cells.
         assert!((to.row(15)[20] - 72.0).abs() < 1e-3, "{}", to.row(15)[20]);
         assert!((to.row(15)[23] + 9.0).abs() < 1e-3, "{}", to.row(15)[23]);
         assert!(to.row(3).iter().all(|out| out.abs() < 1e-4));
         let flat = Plane::from_fn(12, 5, |_, _| 7.0);
-        stand_out(&flat, &mut to, &mut Lines::default());
+        stand_out(&flat, &mut to, &mut StandOutScratch::default());
         assert!(
             to.samples().iter().all(|out| out.abs() < 1e-4),
             "borders and narrow pictures stand out of nothing"

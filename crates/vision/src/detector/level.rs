@@ -2,23 +2,23 @@
 //! over the last seconds, and how much it has changed now.
 
 use crossfix_correlation::Plane;
-use pulp::Arch;
 
-use super::filter::{Lines, SURROUNDINGS, between, moved, resample, stand_out};
+use super::cell_update::{BackgroundRow, CellUpdate, slope_squared};
+use super::filter::{SURROUNDINGS, StandOutScratch, between, moved, resample, stand_out};
 use crate::noise::{OF_MEDIAN, median};
 
 /// A squared change counts in the learnt mean and variance for at most this many variances: what
 /// passes by is no noise of the place. With half of it flickering leaves take twice as long to be
 /// learnt; without it the first target makes its path blind, and the place where it was before it
 /// was found looks like something that has come.
-const OUTLYING: f32 = 16.0;
+pub(super) const OUTLYING: f32 = 16.0;
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a
 /// level, and with half of it each such step is two standard deviations.
 const LEAST_SPREAD: f32 = 0.5;
 /// Standard deviation by which contrasts vary from place to place when the light changes, as a
 /// share of the contrast. With half of it a cloud's shadow changes sharp edges by three standard
 /// deviations.
-const CONTRAST_SPREAD: f32 = 0.03;
+pub(super) const CONTRAST_SPREAD: f32 = 0.03;
 /// Bounds of the sway, px: no scene is stiller than the first, and more than the second is no sway
 /// but another scene. With half of the second a shake of half a pixel loses the background.
 const SWAY_PX: [f32; 2] = [0.05, 1.0];
@@ -26,11 +26,11 @@ const SWAY_PX: [f32; 2] = [0.05, 1.0];
 /// view: targets cover less, and another scene has hardly a cell in common. With half of it a flock
 /// over a sixth of them counts as another scene.
 const MOST_CHANGED: f32 = 0.3;
-/// The sway is told by the cells that a sway of this size, px, changes by more than noise; with
-/// half of it fewer scenes have enough of them, with twice as much noise is taken for sway.
+/// The sway is estimated from the cells that a sway of this size, px, changes by more than noise;
+/// with half of it fewer scenes have enough of them, with twice as much noise is taken for sway.
 const PROBE_PX: f32 = 0.25;
-/// Sway that is assumed before any image tells it, px. With half of it only the edges of scenes too
-/// bare to tell it make more plots.
+/// Sway that is assumed before any image shows it, px. With half of it only the edges of scenes too
+/// bare to show it make more plots.
 const FIRST_SWAY_PX: f32 = 0.5;
 /// Time constant with which a scene that has swayed is believed to be still again, s: that of a
 /// gust or a step. With half of it the second swing of a mast is taken for something that moves.
@@ -40,23 +40,28 @@ const STILL_AGAIN_S: f64 = 0.3;
 const PERSISTENCE_IMAGES: f32 = 10.0;
 /// Least change of a plot, standard deviations. With 4 slow targets in still video are found half a
 /// second later; with 3 there are so many plots of noise that more is asked of each candidate, and
-/// faint targets are found later too.
+/// faint targets are found later too. With half of it nearly every tenth cell of noise is a plot.
 pub(super) const LEAST_CHANGE: f32 = 3.5;
 /// Noise that lasts is not averaged out by looking again: what stands out is compared with the
 /// noise's variance over many images, `(1 + p) / (1 - p)` times that of one image for a persistence
 /// p, but at most this many times. That is a p of 0.7; compressed video has 0.9, which would ask
-/// for 19 and lose birds and far drones.
+/// for 19 and lose birds and far drones. With half of it noise that lasts stands 1.4 times as high
+/// in compressed video.
 const MOST_LASTING: f32 = 6.0;
-/// Number of cells that tell a spread, a contrast or a persistence to two per cent, ...
+/// Number of cells from which a spread, a contrast or a persistence is known to two per cent. With
+/// half of it they are known to three.
 const SAMPLES: usize = 4096;
-/// ... and the fewest that tell a contrast, or, sampled twice as densely, a sway: fewer may be
-/// those of a target. With half of `SAMPLES` those are told to three per cent.
+/// Fewest cells from which a contrast is estimated: fewer may be those of a target. With half of it
+/// one large target can pass for a change of the light.
 const LEAST_SAMPLES: usize = 100;
+/// Fewest cells from which a sway is estimated, sampled twice as densely: fewer may be those of a
+/// target. With half of it one target that moves can pass for a scene that sways.
 const LEAST_TEXTURED: usize = 40;
-/// The contrast is told by cells that stand out by this many spreads, and is limited to this range:
-/// beyond it is another scene, or none. With half of the first each ratio is off by up to a half,
-/// with half of the range a step of the exposure by two changes every edge.
-const CONTRAST_TOLD_BY: f32 = 4.0;
+/// The contrast is estimated from cells that stand out by this many spreads. With half of it each
+/// ratio is off by up to a half.
+pub(super) const CONTRAST_SPREADS: f32 = 4.0;
+/// Range of the contrast: beyond it is another scene, or none. With half of the range a step of the
+/// exposure by two changes every edge.
 const CONTRASTS: [f32; 2] = [0.5, 2.0];
 
 /// Time and camera direction of an image, for the background.
@@ -82,11 +87,13 @@ pub(super) struct Cells {
 impl Cells {
     /// Whether the range is in a cell's surroundings: what covers it may stand out there.
     fn are_near(&self, [x, y]: [usize; 2]) -> bool {
-        let is_near = |at: usize, [from, to]: [usize; 2]| {
-            at + SURROUNDINGS >= from && at < to.saturating_add(SURROUNDINGS)
-        };
         is_near(x, self.columns) && is_near(y, self.rows)
     }
+}
+
+/// Whether a column or row is in a range or within a cell's surroundings of it.
+fn is_near(at: usize, [from, to]: [usize; 2]) -> bool {
+    at + SURROUNDINGS >= from && at < to.saturating_add(SURROUNDINGS)
 }
 
 /// One scale.
@@ -100,7 +107,7 @@ pub(super) struct Level {
     /// The image's means over the cells.
     pub(super) reduced: Plane,
     stands_out: Plane,
-    lines: Lines,
+    lines: StandOutScratch,
     /// By how much the background's cells stand out in this image, levels.
     pub(super) now: Plane,
     /// Mean and variance of `now` over the last seconds.
@@ -120,7 +127,7 @@ pub(super) struct Level {
     /// Correlation of an image's changes with the next one's, 0 to 1: 0 for a sensor's noise, 0.9
     /// for compressed video.
     pub(super) persistence: f32,
-    /// Whether so many cells have changed that the scene cannot be that of the background.
+    /// Whether too many cells have changed for the scene to be that of the background.
     is_lost: bool,
     /// This image's changes and the last one's at some cells.
     samples: [Vec<f32>; 2],
@@ -133,7 +140,7 @@ impl Level {
             cell,
             reduced: Plane::default(),
             stands_out: Plane::default(),
-            lines: Lines::default(),
+            lines: StandOutScratch::default(),
             now: Plane::default(),
             mean: Plane::default(),
             variance: Plane::default(),
@@ -255,26 +262,34 @@ impl Level {
     /// Estimates the light, the noise and the sway from this image's changes.
     fn compare(&mut self, interval: f64, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
-        // An odd step: the samples do not all come from the same few columns.
-        let step = (width * height / SAMPLES) | 1;
+        let step = sampling_step(width * height);
         // Contrast c: the median of now / mean over the cells that stand out.
         let cells = || self.mean.samples().iter().zip(self.now.samples()).step_by(step);
         self.scratch.clear();
         self.scratch.extend(
             cells()
-                .filter(|(mean, _)| mean.abs() > CONTRAST_TOLD_BY * self.spread)
+                .filter(|(mean, _)| mean.abs() > CONTRAST_SPREADS * self.spread)
                 .map(|(mean, now)| now / mean),
         );
-        let told = self.scratch.len() >= LEAST_SAMPLES;
-        self.contrast =
-            if told { median(&mut self.scratch).clamp(CONTRASTS[0], CONTRASTS[1]) } else { 1.0 };
+        let is_known = self.scratch.len() >= LEAST_SAMPLES;
+        self.contrast = if is_known {
+            median(&mut self.scratch).clamp(CONTRASTS[0], CONTRASTS[1])
+        } else {
+            1.0
+        };
         // Spread: standard deviation of now - c mean, by the median of its absolute values.
         self.scratch.clear();
         self.scratch.extend(cells().map(|(mean, now)| (now - self.contrast * mean).abs()));
         self.spread = (OF_MEDIAN * median(&mut self.scratch)).max(LEAST_SPREAD);
+        self.estimate_sway(interval, known);
+    }
 
-        // Sway: solve change^2 = sway slope^2 + usual variance, over the textured cells together.
-        let (mut slopes, mut changes, mut told_by, mut changed) = (0.0_f32, 0.0_f32, 0, 0);
+    /// Estimates the scene's sway: solves change^2 = sway slope^2 + usual variance, over the
+    /// textured cells together.
+    fn estimate_sway(&mut self, interval: f64, known: &[Cells]) {
+        let (width, height) = (self.now.width(), self.now.height());
+        let step = sampling_step(width * height);
+        let (mut slopes, mut changes, mut textured, mut changed) = (0.0_f32, 0.0_f32, 0, 0);
         // Squared, in cells: a sway of variance w changes a cell of slope g by the variance w g^2.
         let [least, most] = SWAY_PX.map(|px| (px / self.cell as f32).powi(2));
         let probe = (PROBE_PX / self.cell as f32).powi(2);
@@ -286,7 +301,7 @@ impl Level {
             }
             let slope =
                 slope_squared([mean[i - 1], mean[i + 1]], [mean[i - width], mean[i + width]]);
-            // A cell tells the sway only if a sway of `PROBE_PX` changes it by more than noise
+            // A cell shows the sway only if a sway of `PROBE_PX` changes it by more than noise
             // does, and if no known target can stand out there.
             if probe * slope > noise
                 && !known.iter().any(|cells| cells.are_near([i % width, i / width]))
@@ -294,7 +309,7 @@ impl Level {
                 let usual = self.variance.samples()[i].max(noise);
                 let expected = probe * slope + usual;
                 let change = self.now.samples()[i] - self.contrast * mean[i];
-                told_by += 1;
+                textured += 1;
                 changed += usize::from(change * change > LEAST_CHANGE * LEAST_CHANGE * expected);
                 // w = sum((change^2 - usual) / e) / sum(g^2 / e), e the expected squared change.
                 // What exceeds the largest sway and outlying noise together is cut off.
@@ -303,14 +318,14 @@ impl Level {
                     ((change * change).min(most * slope + OUTLYING * usual) - usual) / expected;
             }
         }
-        // A scene without texture tells neither its sway nor whether it is another one.
-        let is_told = told_by >= LEAST_TEXTURED;
-        self.is_lost = is_told && changed as f32 > MOST_CHANGED * told_by as f32;
-        if is_told {
-            let told = (changes / slopes).clamp(least, most);
+        // A scene without texture shows neither its sway nor whether it is another one.
+        let is_textured = textured >= LEAST_TEXTURED;
+        self.is_lost = is_textured && changed as f32 > MOST_CHANGED * textured as f32;
+        if is_textured {
+            let sway = (changes / slopes).clamp(least, most);
             // A camera that is shaken is believed at once, one that is still only later.
             let share = 1.0 - (-interval / STILL_AGAIN_S).exp() as f32;
-            self.sway = told.max(self.sway + share * (told - self.sway));
+            self.sway = sway.max(self.sway + share * (sway - self.sway));
         }
     }
 
@@ -345,7 +360,7 @@ impl Level {
     /// Updates the persistence: how much of the changes lasts from image to image.
     fn remember_changes(&mut self) {
         let changes = self.change.samples();
-        let step = (changes.len() / SAMPLES) | 1;
+        let step = sampling_step(changes.len());
         self.samples.swap(0, 1);
         let [before, now] = &mut self.samples;
         now.clear();
@@ -358,71 +373,16 @@ impl Level {
             let product: f32 =
                 now.iter().zip(before.iter()).map(|(now, before)| now * before).sum();
             let squares: f32 = now.iter().chain(before.iter()).map(|change| change * change).sum();
-            let told = (2.0 * product / squares.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0);
-            self.persistence += (told - self.persistence) / PERSISTENCE_IMAGES;
+            let now = (2.0 * product / squares.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0);
+            self.persistence += (now - self.persistence) / PERSISTENCE_IMAGES;
         }
     }
 }
 
-/// Squared slope, (levels per cell)^2, by central differences between the neighbours.
-#[inline(always)]
-fn slope_squared([left, right]: [f32; 2], [above, below]: [f32; 2]) -> f32 {
-    0.25 * ((right - left) * (right - left) + (below - above) * (below - above))
-}
-
-/// One image's update of the background's cells.
-#[derive(Clone, Copy, Debug)]
-struct CellUpdate {
-    share: f32,
-    noise: f32,
-    sway: f32,
-    contrast: f32,
-}
-
-/// One row of the background, or a part of it.
-#[derive(Debug)]
-struct BackgroundRow<'a> {
-    now: &'a [f32],
-    textures: &'a [f32],
-    mean: &'a mut [f32],
-    variance: &'a mut [f32],
-    change: &'a mut [f32],
-}
-
-impl CellUpdate {
-    /// Variance of each cell's change in a row, from the scene's sway and the light: `sway slope^2
-    /// + (CONTRAST_SPREAD mean)^2`.
-    fn textures(self, above: &[f32], here: &[f32], below: &[f32], to: &mut Vec<f32>) {
-        let Self { sway, .. } = self;
-        to.clear();
-        to.resize(here.len(), 0.0);
-        Arch::new().dispatch(|| {
-            let columns = here.windows(3).zip(&above[1..]).zip(&below[1..]);
-            for (out, ((near, above), below)) in to[1..].iter_mut().zip(columns) {
-                // Beside the sway, light changes the contrast of every cell by a share of its own.
-                let lit = CONTRAST_SPREAD * near[1];
-                *out = sway * slope_squared([near[0], near[2]], [*above, *below]) + lit * lit;
-            }
-        });
-    }
-
-    fn learn(self, row: BackgroundRow<'_>) {
-        let Self { share, noise, contrast, .. } = self;
-        Arch::new().dispatch(|| {
-            let learnt = row.mean.iter_mut().zip(row.variance).zip(row.change);
-            for (((mean, variance), change), (now, texture)) in
-                learnt.zip(row.now.iter().zip(row.textures))
-            {
-                // In standard deviations; mean and variance learn from it with a limit on outliers.
-                let off = now - contrast * *mean;
-                let usual = variance.max(noise);
-                *change = off / (usual + texture).sqrt();
-                let most = (OUTLYING * usual).sqrt();
-                *mean += share * off.clamp(-most, most);
-                *variance += share * ((off * off).min(OUTLYING * usual) - *variance);
-            }
-        });
-    }
+/// Step between the cells that are sampled, of a number of cells: odd, so that not all of them come
+/// from the same few columns.
+fn sampling_step(cells: usize) -> usize {
+    (cells / SAMPLES) | 1
 }
 
 /// The parts of a row that no known target covers.

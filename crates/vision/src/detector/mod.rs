@@ -14,6 +14,7 @@
 //! clips of a fixed camera, thermal and visible; a frame is right with a box within 10 px.
 
 mod candidates;
+mod cell_update;
 mod filter;
 mod level;
 mod outline;
@@ -24,7 +25,7 @@ use crossfix_correlation::Plane;
 use crate::crop::replace_invalid;
 use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
-use filter::{Lines, between, halve, stand_out};
+use filter::{StandOutScratch, between, halve, stand_out};
 use level::{Cells, Level, Moment};
 use plots::Plot;
 
@@ -34,12 +35,16 @@ const CELLS: [usize; 4] = [2, 4, 8, 16];
 /// Fewest cells per side of a scale: a cell's surroundings, and as much again. With half of it
 /// hardly a cell has whole surroundings.
 const LEAST_CELLS: usize = 18;
-/// How long the background is learnt before anything is found, s, and in how many images at least.
-/// With half of the first the background is a mean of 4 images at first, at 30 per second, whose
-/// noise adds a quarter to the variance of the changes.
+/// How long the background is learnt before anything is found, s. With half of it the background is
+/// a mean of 4 images at first, at 30 per second, whose noise adds a quarter to the variance of the
+/// changes.
 const WARM_UP_S: f64 = 0.25;
+/// Fewest images from which the background is learnt before anything is found, whatever their rate.
+/// With half of it the background's own noise adds a half to the variance of the changes, in slow
+/// streams.
 const WARM_UP_IMAGES: u32 = 4;
-/// Fewest plots of a candidate that is found: two always lie on a line, however far apart.
+/// Fewest plots of a candidate that is found: two always lie on a line, however far apart. With
+/// half of it any two plots of noise that stand out enough are a target.
 const LEAST_PLOTS: u32 = 3;
 /// A candidate that is found has moved by more than this many times the scene's sway: a swing of
 /// twice its root mean square is common, ...
@@ -51,32 +56,34 @@ const SWAYS: f64 = 3.0;
 const PLACE_ERRORS: f64 = 2.0;
 /// Margin that is asked above the odds of chance, nats: the images of a minute are not as many
 /// chances as they seem, as noise, clouds and leaves of one image are those of the next. With 2
-/// there are 2.3 and 3.8 false tracks per minute (thermal, visible) instead of 1.1 and 3.1.
+/// (half of it) there are 2.3 and 3.8 false tracks per minute (thermal, visible) instead of 1.1
+/// and 3.1.
 const NOT_INDEPENDENT: f64 = 4.0;
 /// Least rate of chances that is reckoned with, 1/min: within the first minute nobody knows the
-/// rate. With half of it twice as many chance candidates pass where fewer are counted.
+/// rate. With half of it twice as many chance candidates count as found where fewer are counted.
 const LEAST_CHANCES: f64 = 600.0;
 /// Margin of a known target that is covered with it: a share of its sides, and px. With half of it
 /// rotors and shadows beyond the box are found as other targets.
 const COVER: [f64; 2] = [0.25, 2.0];
 /// Sides of a target in cells of the scale at which it stands out most. With half of it a target is
-/// watched on the next coarser scale, stands out less there and is sooner taken for the scene.
+/// watched on the next coarser scale, stands out less there and is sooner mistaken for the scene.
 const TARGET_CELLS: f64 = 2.5;
 /// Half side of the part of the image from which it is computed how much a target stands out,
-/// cells.
+/// cells: the surroundings of the target's own cell and its neighbours'. With half of it the
+/// surroundings are cut off, and the part's border is repeated in their place.
 const PART_CELLS: usize = filter::SURROUNDINGS + 2;
 /// A watched target is new in an image if the background lacks at least this share of what stands
 /// out there (with half of it clouds and changing light make the scene new, with twice as much a
-/// target in front of its like is taken for the scene), ...
+/// target in front of its like is mistaken for the scene), ...
 const NEW: f32 = 0.35;
 /// ... and if it stands out by at least this share of the least strength of a plot. With half of it
 /// noise alone, of 1.2 spreads, makes it new in one case of five.
 const STANDS_OUT: f32 = 0.7;
-/// Share of the latest images in which it must be new, and the averaging time of that share, s:
-/// with a smaller share it is the scene, and given up. The scene is given up after 0.6 s; with half
-/// of the first after 0.95, with half of the second after 0.3, and so is a target that passes its
-/// like for as long.
+/// Least share of the latest images in which a watched target must be new: with a smaller share it
+/// is the scene, and given up. That is so after 0.6 s; with half of it after 0.95.
 const LEAST_NEW: f64 = 0.3;
+/// Averaging time of that share, s. With half of it the scene is given up after 0.3 s instead of
+/// 0.6, and so is a target that flies in front of its like for as long.
 const NEW_S: f64 = 0.5;
 
 /// A target that is followed already.
@@ -96,7 +103,7 @@ pub(crate) struct Found {
     pub(crate) gone_px: f64,
 }
 
-/// What an image has told the detector.
+/// What the detector has found in an image.
 #[derive(Debug, Default)]
 pub(crate) struct Findings {
     pub(crate) found: Vec<Found>,
@@ -172,13 +179,13 @@ impl Detector {
             self.forget();
             return Findings::default();
         }
-        let scene = self.judge(interval);
+        let scene = self.take_scene(interval);
         let is_warm = self.age_s >= WARM_UP_S && self.images > WARM_UP_IMAGES;
         let found = if is_warm { self.find(image, interval, turned, known) } else { Vec::new() };
         Findings { found, scene }
     }
 
-    /// Forgets the background and all candidates: the camera looks elsewhere.
+    /// Forgets the background and all candidates: the camera points elsewhere.
     fn forget(&mut self) {
         for level in &mut self.levels {
             *level = Level::new(level.cell());
@@ -240,8 +247,8 @@ impl Detector {
         self.images = self.images.saturating_add(1);
     }
 
-    /// Which of the watched targets are the scene.
-    fn judge(&mut self, interval: f64) -> Vec<ImageTrackId> {
+    /// Removes those of the watched targets that are the scene, and returns them.
+    fn take_scene(&mut self, interval: f64) -> Vec<ImageTrackId> {
         let share = 1.0 - (-interval / NEW_S).exp();
         for watch in &mut self.watches {
             let level = &self.levels[watch.level];
@@ -269,7 +276,7 @@ impl Detector {
         plots::find(&mut self.levels, &mut self.plots);
         self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));
         self.candidates.step(&self.plots, turned, interval, self.sides);
-        let chances = self.candidates.chances_a_minute().max(LEAST_CHANCES);
+        let chances = self.candidates.chances_per_minute().max(LEAST_CHANCES);
         // The odds to beat: chances per minute over the false tracks that are allowed per minute.
         let asked = (chances / self.config.false_tracks_a_minute).ln() + NOT_INDEPENDENT;
         let sway_px = self.levels[0].sway_px();
@@ -309,7 +316,7 @@ fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: [f64; 2]) -> 
         part = halved;
     }
     let mut out = Plane::default();
-    stand_out(&part, &mut out, &mut Lines::default());
+    stand_out(&part, &mut out, &mut StandOutScratch::default());
     // From pixels to cells of the part; the middle of a cell is a whole number on both sides.
     between(&out, [0, 1].map(|i| (place[i] + 0.5) / cell as f64 - 0.5 - corner[i] as f64))
 }

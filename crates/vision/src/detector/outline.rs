@@ -8,15 +8,17 @@ use crate::PixelBox;
 use crate::figure::{figure, smoothed};
 use crate::noise::{OF_MEDIAN, median};
 
-/// Half sides of the window, the first in cells and the largest in pixels: doubled until the figure
-/// lies inside. A target of 50 px and its surroundings fit. With half of the first a try more is
-/// needed, with half of the second the finds of the coarsest scale have no window.
+/// Half side of the first window, cells; it is doubled until the figure lies inside. With half of
+/// it one try more is needed.
 const FIRST_REACH_CELLS: f64 = 4.0;
+/// Largest half side of the window, px: a target of 50 px and its surroundings fit. With half of it
+/// the finds of the coarsest scale have no window.
 const MOST_REACH: usize = 64;
-/// Sides of the box if no outline closes, in cells, and the least sides of any box, px. With half
-/// of the first the box cuts off parts of the target; with half of the second hardly a box changes,
-/// as smoothing makes three pixels of one.
+/// Sides of the box if no outline closes, cells. With half of it the box cuts off parts of the
+/// target.
 const UNKNOWN_CELLS: f64 = 3.0;
+/// Least sides of any box, px. With half of it hardly a box changes, as smoothing makes three
+/// pixels of one.
 const LEAST_SIDE: f64 = 4.0;
 
 /// The box of what stands out at a plot.

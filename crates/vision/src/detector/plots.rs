@@ -12,15 +12,17 @@ const LEAST_OF_CHANGE: f32 = 0.5;
 /// Least and largest share of what stands out that the background lacks: less is the scene itself,
 /// and more lies where something of the opposite sign has gone. With 0.1 a slow target is found
 /// when it has gone by a tenth of its size, with 3 the place that a target has left is another
-/// target.
+/// target. With half of both a thing that has come whole is refused.
 const SHARES: [f32; 2] = [0.02, 1.5];
-/// Within this many cells one thing makes only one plot: it is two or three cells large. ...
+/// Within this many cells one thing makes only one plot: it is two or three cells large. With half
+/// of it one thing begins several candidates.
 const APART: f64 = 3.0;
-/// ... A bright plot's dark ring (and the other way round) reaches this many cells, as far from its
-/// ends as its surroundings do, and has at most this share of its strength: that of a square of
-/// three cells in one of nine, three times over for a thing of several parts. With half of `APART`
-/// one thing begins several candidates; with half of either of these a ring is a plot of its own.
+/// A bright plot's dark ring (and the other way round) reaches this many cells, as far from its
+/// ends as its surroundings do. With half of it a ring is a plot of its own.
 const RING: f64 = 7.0;
+/// Largest share of a plot's strength that its ring has: that of a square of three cells in one of
+/// nine, three times over for a thing of several parts. With half of it a ring is a plot of its
+/// own.
 const MOST_OF_RING: f32 = 0.4;
 /// Most plots of an image: those that stand out most, enough for fifty targets and as much noise.
 /// With half of it strong noise leaves no room for faint targets, whose plots rank last.

@@ -1,11 +1,11 @@
 //! A target that may be in several places.
 
-use super::Target;
+use super::ImageTarget;
 use crate::TrackerConfig;
 use crate::config::GateRule;
 use crate::frame::{FrameInput, TargetStep};
 use crate::gate::Region;
-use crate::hypotheses::DOUBT;
+use crate::hypotheses::ONE_PLACE;
 use crate::motion::ImageMotion;
 use crate::posterior::Posterior;
 use crate::scratch::Scratch;
@@ -17,7 +17,7 @@ use crate::tracker_part::TrackerPart;
 /// of a posterior.
 const LEAST_MOVE_PX: f64 = 2.0;
 
-impl Target {
+impl ImageTarget {
     /// Forks the hypotheses if the camera may have turned: then everything in its image has moved,
     /// the target too. But light that changes may be taken for a turn, so the target may have
     /// stayed as well.
@@ -35,9 +35,9 @@ impl Target {
     }
 
     /// Whether a posterior leaves more than one place to be followed.
-    pub(super) fn must_doubt(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
-        let in_doubt = !self.hypotheses.is_empty() || posterior.near.mass < DOUBT;
-        in_doubt
+    pub(super) fn has_several_places(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
+        let is_unsure = !self.hypotheses.is_empty() || posterior.near.mass < ONE_PLACE;
+        is_unsure
             && config.has(TrackerPart::SeveralPlaces)
             && matches!(config.gate, GateRule::Innovation { .. })
             && !self.identity.is_on_probation()
@@ -66,9 +66,9 @@ impl Target {
         // The likeliest hypothesis is reported; its covariance gets the spread of the others
         // (`covariances`).
         (self.state.motion, self.state.hidden) = (best.motion, best.hidden);
-        self.hypotheses.note_doubt(frame.interval);
+        self.hypotheses.note_unsure(frame.interval);
         let is_unseen =
-            self.hypotheses.seen_share() < 1.0 - DOUBT || self.hypotheses.are_hopeless();
+            self.hypotheses.seen_share() < 1.0 - ONE_PLACE || self.hypotheses.are_hopeless();
         let Some([column, row]) = best.peak else {
             self.state.missed += u32::from(is_unseen);
             self.settle(0.0);
@@ -76,11 +76,11 @@ impl Target {
         };
         let sure = self.hypotheses.share_near([column, row], self.state.peak_half());
         let fit = self.state.fit_at(column, row, region.origin, scratch, frame.config);
-        let is_there = self.identity.doubt(&self.state, frame, fit, scratch);
+        let is_there = self.identity.measurement_update(&self.state, frame, fit, scratch);
         // P(at this place) P(the thing there is the target).
         let certainty = sure * is_there;
         if certainty > SEEN {
-            self.state.motion.tell_noise(fit.found().map(|at| at.variance));
+            self.state.motion.add_noise_of_learned(fit.found().map(|at| at.variance));
             self.seen(fit.place);
         } else if is_unseen || is_there < SEEN {
             self.state.missed += 1;
@@ -93,13 +93,12 @@ impl Target {
 
     /// Forgets the other hypotheses if one place is left, or none.
     fn settle(&mut self, weight: f64) {
-        if weight > DOUBT || self.state.is_searching() {
+        if weight > ONE_PLACE || self.state.is_searching() {
             self.hypotheses.clear();
         }
     }
 
-    /// Settles on the likeliest hypothesis: no doubt is left that the target has been where that
-    /// was.
+    /// Settles on the likeliest hypothesis: the target is sure to have been where that was.
     fn settle_on(
         &mut self,
         motion: ImageMotion,

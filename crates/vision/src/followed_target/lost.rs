@@ -2,23 +2,23 @@
 
 use crossfix_filter::AxisMeasurement;
 
-use super::Target;
+use super::ImageTarget;
 use crate::frame::{FrameInput, TargetStep};
 use crate::scratch::Scratch;
 use crate::search::Sought;
 
 /// A place near the prediction continues the motion if fewer images than this were missed; after
-/// more the motion begins anew. (A limit in seconds unseen counts doubtful images as well: tried,
+/// more the motion begins again. (A limit in seconds unseen counts doubtful images as well: tried,
 /// it doubled the false boxes on a clip of birds and gained nothing on two others.) With half of it
 /// a target that a cloud hides for longer than a third of a second, at 30 images per second, loses
 /// its velocity.
 const CONTINUES_IMAGES: u32 = 20;
 /// Squared distance from the prediction up to which a place is near it, on either axis, over the
-/// prediction's variance. With half of it one right place in 1200 begins the motion anew by chance,
-/// instead of one in a million.
+/// prediction's variance. With half of it one right place in 1200 begins the motion again by
+/// chance, instead of one in a million.
 const CONTINUES_WITHIN: f64 = 25.0;
 
-impl Target {
+impl ImageTarget {
     pub(super) fn search(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> TargetStep {
         self.state.forget_contrast(frame.interval);
         self.state.forget_surroundings();

@@ -2,8 +2,8 @@
 //! the gate and the filters' prediction give where it is, how well that is known, and whether it
 //! can be seen at all.
 //!
-//! A step goes through the stages of `state.rs`: the gate, the posterior, the fit, what remains in
-//! doubt (`identity.rs`, and where there are several places `doubtful.rs`), the filters' update,
+//! A step goes through the stages of `state.rs`: the gate, the posterior, the fit, how sure
+//! that is (`identity.rs`, and where there are several places `doubtful.rs`), the filters' update,
 //! and learning. A target that is lost is searched for (`lost.rs`).
 
 mod doubtful;
@@ -18,7 +18,7 @@ use crate::fit::TargetFit;
 use crate::frame::{FrameInput, Measurement, TargetStep};
 use crate::gate::Region;
 use crate::hypotheses::PlaceHypotheses;
-use crate::identity::Identity;
+use crate::identity::TargetIdentity;
 use crate::motion::PlaceEvidence;
 use crate::posterior::Posterior;
 use crate::scratch::Scratch;
@@ -31,22 +31,25 @@ use crate::{ImagePoint, PixelBox, TrackerConfig};
 /// to 0.7 px are left to the peak's moments, to which the pixels add a twelfth.
 const NARROW: f64 = 0.5;
 /// Least gain of a measurement that is taken out of a peak of the map: with less, chance would be
-/// taken for a measurement far off the prediction.
-const LEAST_TOLD: f64 = 0.1;
+/// taken for a measurement far off the prediction. With half of it such a measurement is up to
+/// twice as far off.
+const LEAST_GAIN: f64 = 0.1;
 /// Largest product of the half sides of a gate in which a target in doubt is looked for, px^2: a
 /// gate of 280 by 280 px takes 10 ms. With no limit it grows to the whole image, and takes 60. With
 /// half of it a drawn target in noise is lost in 20 % of its frames instead of 2, and something
 /// else taken for it for four seconds.
 const MOST_IN_DOUBT: usize = 20_000;
 /// Certainty above which the rest of the gate is not looked at: what is there could take no more
-/// from it than this leaves. With 0.9 a tenth of it could, which is a doubt already.
+/// from it than this leaves. With 0.9 a tenth of it could, and then
+/// the place is not sure. With half of it the rest of the gate is left out where it has the target
+/// once in two times.
 const SURE: f64 = 0.99;
 
 /// A target under track.
 #[derive(Clone, Debug)]
-pub(crate) struct Target {
+pub(crate) struct ImageTarget {
     pub(crate) state: TargetBelief,
-    pub(crate) identity: Identity,
+    pub(crate) identity: TargetIdentity,
     pub(crate) hypotheses: PlaceHypotheses,
     pub(crate) search_memory: SearchMemory,
 }
@@ -58,7 +61,7 @@ fn without_prior(posterior: AxisMeasurement, prior: AxisMeasurement) -> AxisMeas
     // have.
     let known = (posterior.variance - 1.0 / 12.0).max(1e-3 * prior.variance);
     // Gain K = 1 - P+ / P, hence z = x + (x+ - x) / K and R = P (1 / K - 1).
-    let share = (1.0 - known / prior.variance).max(LEAST_TOLD);
+    let share = (1.0 - known / prior.variance).max(LEAST_GAIN);
     let off = (posterior.position - prior.position) / share;
     AxisMeasurement {
         position: prior.position + off,
@@ -73,7 +76,7 @@ fn narrowed(half: [usize; 2]) -> [usize; 2] {
     half.map(|side| if share < 1.0 { ((side as f64 * share.sqrt()) as usize).max(1) } else { side })
 }
 
-impl Target {
+impl ImageTarget {
     /// Takes a target up.
     ///
     /// The velocity is unknown but for its prior: with the next measurement the state becomes that
@@ -87,7 +90,7 @@ impl Target {
     ) -> Self {
         Self {
             state: TargetBelief::new(image, place, scratch, config),
-            identity: Identity::new(),
+            identity: TargetIdentity::new(),
             hypotheses: PlaceHypotheses::default(),
             search_memory: SearchMemory::default(),
         }
@@ -109,7 +112,7 @@ impl Target {
 
     /// Whether it is searched for, or has not been sure in any place for long.
     pub(crate) fn is_lost(&self) -> bool {
-        self.state.is_searching() || self.hypotheses.are_doubted()
+        self.state.is_searching() || self.hypotheses.are_lost()
     }
 
     /// Follows the target into the next image.
@@ -190,7 +193,7 @@ impl Target {
         );
         self.state.note_noise(noise, frame.interval);
 
-        // The whole gate is looked at only if the middle of it leaves a doubt.
+        // The whole gate is looked at only if the middle of it leaves the place unsure.
         let middle = if self.hypotheses.is_empty() {
             self.state.middle_of_gate(whole.half, config)
         } else {
@@ -202,7 +205,7 @@ impl Target {
             Some(sure) => sure,
             None => (self.state.posterior(frame, whole, scratch), whole),
         };
-        if self.must_doubt(&posterior, config) {
+        if self.has_several_places(&posterior, config) {
             return self.follow_hypotheses(frame, region, scratch);
         }
         let [column, row] = posterior.peak;
@@ -219,12 +222,12 @@ impl Target {
         origin: [f64; 2],
         scratch: &mut Scratch,
     ) -> TargetStep {
-        let is_there = self.identity.doubt(&self.state, frame, fit, scratch);
-        let doubted = posterior.doubted(is_there);
-        let certainty = doubted.near.mass;
+        let is_there = self.identity.measurement_update(&self.state, frame, fit, scratch);
+        let discounted = posterior.discounted(is_there);
+        let certainty = discounted.near.mass;
         let found = fit.found();
         if certainty > SEEN {
-            self.state.motion.tell_noise(found.map(|at| at.variance));
+            self.state.motion.add_noise_of_learned(found.map(|at| at.variance));
         }
         let distance = self.state.motion.nis(found);
         let step =
@@ -238,7 +241,7 @@ impl Target {
         }
         // Whether what is followed is the target is said by the certainty; the covariance is that
         // of its place if it is.
-        let posterior = if certainty > SEEN { posterior } else { &doubted };
+        let posterior = if certainty > SEEN { posterior } else { &discounted };
         self.state.motion.update(&self.evidence(posterior, found, origin, frame.config));
         let (estimate, hidden) = (self.state.position(), posterior.unseen);
         if certainty > SEEN {

@@ -4,9 +4,11 @@
 use crossfix_filter::AxisMeasurement;
 use nalgebra::{Matrix3, RowVector3, Vector3};
 
-/// Indices of the states of an axis.
+/// Index of the position, px, among the states of an axis.
 pub(super) const POSITION: usize = 0;
+/// Index of the velocity, px/s.
 pub(super) const VELOCITY: usize = 1;
+/// Index of the reference's offset, px.
 pub(super) const OFFSET: usize = 2;
 /// Measurement matrix H: the reference is found at position plus offset.
 pub(super) const FOUND_AT: RowVector3<f64> = RowVector3::new(1.0, 0.0, 1.0);
@@ -19,6 +21,16 @@ pub(super) struct AxisMotion {
 }
 
 impl AxisMotion {
+    /// A target at rest whose given place has become the middle of its reference.
+    pub(super) fn at_rest(given: AxisMeasurement, velocity_sd: f64) -> Self {
+        // P = v o o', o = [1, 0, -1]': H o = 0, so that the given place's error is not in where the
+        // reference is found.
+        let off = Vector3::new(1.0, 0.0, -1.0);
+        let mut covariance = off * off.transpose() * given.variance;
+        covariance[(VELOCITY, VELOCITY)] = velocity_sd.powi(2);
+        Self { mean: Vector3::new(given.position, 0.0, 0.0), covariance }
+    }
+
     pub(super) fn found(&self) -> AxisMeasurement {
         let position = self.mean[POSITION] + self.mean[OFFSET];
         AxisMeasurement {

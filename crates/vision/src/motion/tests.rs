@@ -52,7 +52,7 @@ impl Flight {
             position: self.position[i] + self.offset[i] + noise[i],
             variance,
         });
-        self.motion.tell_noise([variance; 2]);
+        self.motion.add_noise_of_learned([variance; 2]);
         let nis = self.motion.nis(at);
         self.motion.update(&PlaceEvidence { near: 1.0, at, elsewhere: 0.0, elsewhere_at: at });
         self.motion.match_noise(nis);

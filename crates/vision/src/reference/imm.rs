@@ -109,17 +109,7 @@ pub struct PixelImm {
 impl PixelImm {
     /// Filters that start at given brightnesses, measured with noise of a given variance.
     pub fn new(config: ImmConfig, brightness: &[f32], variance: f32) -> Self {
-        let blocks = brightness.chunks(LANES).map(|pixels| {
-            let mut first = [0.0; LANES];
-            first[..pixels.len()].copy_from_slice(pixels);
-            let [variance, rate_variance] = [variance, 1.0].map(Lanes::splat);
-            let state =
-                [Lanes(first), Lanes::splat(0.0), variance, Lanes::splat(0.0), rate_variance];
-            EightPixels {
-                states: [state; MODELS],
-                probabilities: [Lanes::splat(1.0 / MODELS as f32); MODELS],
-            }
-        });
+        let blocks = brightness.chunks(LANES).map(|pixels| EightPixels::start(pixels, variance));
         Self { config, blocks: blocks.collect() }
     }
 
@@ -165,6 +155,15 @@ impl WithSimd for FilterStep<'_> {
 }
 
 impl EightPixels {
+    /// Filters that start at the brightness of up to eight pixels, all models equally likely.
+    fn start(pixels: &[f32], variance: f32) -> Self {
+        let mut first = [0.0; LANES];
+        first[..pixels.len()].copy_from_slice(pixels);
+        let [variance, rate_variance] = [variance, 1.0].map(Lanes::splat);
+        let state = [Lanes(first), Lanes::splat(0.0), variance, Lanes::splat(0.0), rate_variance];
+        Self { states: [state; MODELS], probabilities: [Lanes::splat(1.0 / MODELS as f32); MODELS] }
+    }
+
     /// One step of eight pixels; returns their filtered brightness.
     #[inline(always)]
     fn step(

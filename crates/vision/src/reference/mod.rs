@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 pub use imm::{ImmConfig, PixelImm};
 
-/// The interval of the frames in which Solonar 2023 counts times, s.
+/// The interval of the frames in which Solonar 2023 counts times, s, as the paper has it.
 const PAPERS_FRAME_S: f32 = 1.0 / 30.0;
 
 /// How the reference is formed from the images of the target.

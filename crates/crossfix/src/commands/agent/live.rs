@@ -20,7 +20,7 @@ use crate::service;
 const POLL: Duration = Duration::from_millis(200);
 
 /// If stream time and arrival time between two frames differ by this much, the stream has started a
-/// new count, s. With half of it an image that was held up for a second on its way moves the
+/// new count, s. With half of it an image that was delayed by a second on its way moves the
 /// tracker's time a second too far.
 const ANOTHER_COUNT_S: f64 = 2.0;
 /// The shortest time between two frames that the tracker is given, s: its time must always advance.

@@ -21,6 +21,7 @@ use self::seeking::Seeking;
 use self::start::Start;
 use self::stream_health::StreamHealth;
 use crate::calibrated::Calibrated;
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::config::{self, CameraFile, ClockConfig, SourceConfig};
 use crate::eye::{CameraIdentity, brightness};
@@ -46,7 +47,9 @@ pub const BEHIND: Duration = Duration::from_millis(500);
 
 /// Run one camera host: find and follow targets, publish their bearings.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix agent -c configs/site/north.toml")]
+#[command(after_help = examples(&[
+    "crossfix agent -c configs/site/north.toml",
+]))]
 pub struct Args {
     /// The camera's configuration (TOML).
     #[arg(short, long, value_name = "FILE")]
@@ -95,7 +98,7 @@ struct Agent {
     frames: u64,
     bad_frames: u64,
     unseen_bearings: u64,
-    /// Number of images for which the mount did not report where they were taken.
+    /// Number of images for which the mount did not report where it pointed.
     without_pointing: u64,
     /// Number of tracks in the newest frame.
     tracks: u32,
@@ -128,7 +131,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let Some(start) = agent.begin(args, &file, &network, begins)? else {
         return agent.finish(Ok(()));
     };
-    let seen = agent.look(&file, begins, &start);
+    let seen = agent.play(&file, begins, &start);
     agent.finish(seen)
 }
 
@@ -254,7 +257,7 @@ impl Agent {
     }
 
     /// Follows targets in the source's images until its end.
-    fn look(&mut self, file: &CameraFile, begins: Timestamp, start: &Start) -> anyhow::Result<()> {
+    fn play(&mut self, file: &CameraFile, begins: Timestamp, start: &Start) -> anyhow::Result<()> {
         match &file.source {
             SourceConfig::Recording { path, speed } => self.replay(path, begins, start, *speed),
             SourceConfig::Video { path, rate_hz, speed, .. } => {

@@ -23,7 +23,7 @@ impl Agent {
         }
         if due(self.healthy_at, health::PERIOD) {
             service::alive();
-            self.lookout.look(Instant::now());
+            self.lookout.check(Instant::now());
             self.repeats.remind(Instant::now());
             // The reload of a live camera's file happens where the camera is watched.
             if self.stream.is_none() && self.shutdown.take_reload() {

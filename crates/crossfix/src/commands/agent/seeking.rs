@@ -1,4 +1,4 @@
-//! An agent whose camera looks for the targets that the fusion centre's cues name.
+//! An agent whose camera searches for the targets that the fusion centre's cues name.
 
 use std::time::{Duration, Instant};
 
@@ -23,7 +23,7 @@ use crate::seeker::{Mount, Orders, Pointed, Seeker};
 /// would be reported.
 const LONGEST_TURN: Duration = Duration::from_secs(30);
 /// A view is unchanged while the mount's reported angles stay within this many SDs. With half of it
-/// noise in its reports would be taken for a turn, and the tracker would start again.
+/// noise in its reports would look like a turn, and the tracker would start again.
 const SAME_SDS: f64 = 3.0;
 
 /// Connects the seeker of a camera with its cues and its mount.
@@ -79,18 +79,18 @@ impl Seeking {
     }
 
     /// Takes in new cues and applies them to a frame: marks in it the track that is taken over, and
-    /// tells the mount where to turn.
-    fn look(&mut self, frame: &mut BearingFrame) {
+    /// orders the mount where to turn.
+    fn seek(&mut self, frame: &mut BearingFrame) {
         while let Some(received) = self.cues.next(Duration::ZERO) {
             // A malformed message has no effect.
             let Ok(cues) = decode::<CueFrame>(&received.data) else { continue };
             if cues.camera == frame.camera {
-                self.seeker.hear(cues);
+                self.seeker.take_cues(cues);
             }
         }
         self.seeker.hold(self.mount.as_ref().is_some_and(|mount| !mount.obeys()));
         let time = Timestamp::from_nanos(frame.capture_time_ns);
-        let Orders { aim, taken_over } = self.seeker.look(time, self.pointed, &frame.tracks);
+        let Orders { aim, taken_over } = self.seeker.observe(time, self.pointed, &frame.tracks);
         if let (Some(mount), Some(aim)) = (&mut self.mount, aim) {
             mount.aim(aim);
         }
@@ -118,8 +118,8 @@ pub(super) fn mount_of(file: &CameraFile) -> anyhow::Result<Option<Box<dyn Mount
 /// A live camera's mount: an error if the file needs ONVIF, which this build leaves out.
 #[cfg(not(feature = "onvif"))]
 pub(super) fn mount_of(file: &CameraFile) -> anyhow::Result<Option<Box<dyn Mount>>> {
-    let told = file.mount.as_ref().is_some_and(|mount| mount.onvif.is_some());
-    if told { Err(parts::is_left_out("mounts by ONVIF", "onvif")) } else { Ok(None) }
+    let has_onvif = file.mount.as_ref().is_some_and(|mount| mount.onvif.is_some());
+    if has_onvif { Err(parts::is_left_out("mounts by ONVIF", "onvif")) } else { Ok(None) }
 }
 
 impl Agent {
@@ -135,7 +135,8 @@ impl Agent {
         }
         ensure!(
             file.mount.is_none() || mount.is_some(),
-            "section [mount]: nothing turns this source's camera; [mount.onvif] turns network cameras"
+            "section [mount]: nothing turns this source's camera; [mount.onvif] turns network \
+             cameras"
         );
         let camera = &self.identity.camera;
         let angle_sd_rad = file.mount.as_ref().map_or(0.0, |mount| mount.angle_sd_mrad * 1e-3);
@@ -193,7 +194,7 @@ impl Agent {
     /// Applies the fusion centre's cues to a frame.
     pub(super) fn seek(&mut self, frame: &mut BearingFrame) {
         if let Some(seeking) = &mut self.seeking {
-            seeking.look(frame);
+            seeking.seek(frame);
         }
     }
 }

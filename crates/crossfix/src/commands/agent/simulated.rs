@@ -18,21 +18,21 @@ use crate::shutdown::Shutdown;
 
 /// A simulated mount, with the time (s) and pointing of the camera's newest frame.
 #[derive(Debug)]
-struct Turned {
+struct TurnedMount {
     mount: SimulatedMount,
     newest: Option<(f64, MountState)>,
 }
 
 /// A simulated mount, shared by the camera and the agent.
 #[derive(Clone, Debug)]
-struct SharedMount(Arc<Mutex<Turned>>);
+struct SharedMount(Arc<Mutex<TurnedMount>>);
 
 impl SharedMount {
     fn new(mount: SimulatedMount) -> Self {
-        Self(Arc::new(Mutex::new(Turned { mount, newest: None })))
+        Self(Arc::new(Mutex::new(TurnedMount { mount, newest: None })))
     }
 
-    fn with<T>(&self, act: impl FnOnce(&mut Turned) -> T) -> T {
+    fn with<T>(&self, act: impl FnOnce(&mut TurnedMount) -> T) -> T {
         // A panic cannot leave the state half changed.
         act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
     }
@@ -57,7 +57,7 @@ impl Mount for SharedMount {
     }
 
     fn pointed(&mut self) -> Pointed {
-        // Each frame is processed before the next one is taken.
+        // Each frame is processed before the next one is read.
         let newest =
             self.with(|turned| turned.newest.map(|(_, state)| (state.said, state.settled)));
         match newest {
@@ -156,7 +156,7 @@ struct TruthPublisher {
 
 impl TruthPublisher {
     /// Positions per second of data, Hz: a target at 20 m/s moves by 2 m between two. Tracks are
-    /// judged at these times; with half of it, at half as many.
+    /// compared at these times; with half of it, at half as many.
     const RATE_HZ: f64 = 10.0;
 
     /// A publisher for a scene that begins `start` seconds after the Unix epoch.

@@ -81,7 +81,7 @@ enum ScenePlayback {
     Waits,
 }
 
-fn judge(health: &Health, cameras: &[CameraName]) -> ScenePlayback {
+fn playback_of(health: &Health, cameras: &[CameraName]) -> ScenePlayback {
     if health.is_playing {
         return ScenePlayback::Plays {
             now: Timestamp::from_nanos(health.time_ns),
@@ -110,7 +110,7 @@ impl Agent {
         // later.
         let has_ears = |agent: &Self| agent.bearings.has_subscribers();
         while !self.shutdown.requested() {
-            self.lookout.look(Instant::now());
+            self.lookout.check(Instant::now());
             service::alive();
             let recording = self.lookout.is_here(&recorder_alive);
             // Where several areas listen, one is enough if the others do not come in time.
@@ -173,7 +173,7 @@ impl Agent {
             let Some(received) = reports.next(POLL) else { continue };
             let Ok(health) = decode::<Health>(&received.data) else { continue };
             let area = received.key.area;
-            match judge(&health, &network.cameras_of(area.as_ref())?) {
+            match playback_of(&health, &network.cameras_of(area.as_ref())?) {
                 ScenePlayback::Plays { now, scene_begins } => {
                     return Ok(Some(self.join(file, begins, now, scene_begins)));
                 }
@@ -226,10 +226,10 @@ mod tests {
             is_playing,
             ..Default::default()
         };
-        assert_eq!(judge(&health(false, &["a"]), &cameras), ScenePlayback::Waits);
+        assert_eq!(playback_of(&health(false, &["a"]), &cameras), ScenePlayback::Waits);
         // A file may have been played to its end before.
-        assert_eq!(judge(&health(false, &["b", "a"]), &cameras), ScenePlayback::IsComplete);
-        let plays = judge(&health(true, &["b", "a"]), &cameras);
+        assert_eq!(playback_of(&health(false, &["b", "a"]), &cameras), ScenePlayback::IsComplete);
+        let plays = playback_of(&health(true, &["b", "a"]), &cameras);
         assert!(matches!(plays, ScenePlayback::Plays { now, .. } if now == at));
     }
 }

@@ -21,9 +21,9 @@ const MOST_SAMPLES: usize = 1000;
 
 /// Durations since the last report, which covers a second, microseconds.
 #[derive(Debug, Default)]
-struct Samples(Vec<u64>);
+struct DurationSamples(Vec<u64>);
 
-impl Samples {
+impl DurationSamples {
     fn add(&mut self, time: Duration) {
         if self.0.len() < MOST_SAMPLES {
             self.0.push(u64::try_from(time.as_micros()).unwrap_or(u64::MAX));
@@ -55,9 +55,9 @@ pub struct StreamHealth {
     late: u64,
     repeated: u64,
     counts: LiveCounts,
-    from_arrival: Samples,
-    from_exposure: Samples,
-    intervals: Samples,
+    from_arrival: DurationSamples,
+    from_exposure: DurationSamples,
+    intervals: DurationSamples,
 }
 
 impl StreamHealth {
@@ -122,7 +122,7 @@ impl StreamHealth {
         self.counts = counts;
     }
 
-    /// Problems that a person should look at now.
+    /// Problems that need a person's attention now.
     pub fn problems(&self, now: Instant) -> Vec<String> {
         let lost = self.lost.as_ref().map(|what| format!("sees nothing: {what}"));
         let size = self.wrong_size.clone();
@@ -130,12 +130,12 @@ impl StreamHealth {
         let is_late = since.is_some_and(|at| now.saturating_duration_since(at) > FIRST_REPORT);
         let clock = match self.timed_by {
             Some(TimedBy::ArrivalAgainstCamera { camera_ahead_s }) => Some(format!(
-                "the camera's clock is {camera_ahead_s:+.1} s from this host's: images are timed by \
-                 their arrival; set the camera to a time server"
+                "the camera's clock is {camera_ahead_s:+.1} s from this host's: images are timed \
+                 by their arrival; set the camera to a time server"
             )),
             Some(TimedBy::Arrival) if is_late && self.heeds_reports => Some(
-                "the camera does not say what its clock shows (RTCP sender reports; of an industrial \
-                 one, what it answers): images are timed by their arrival"
+                "the camera does not say what its clock shows (RTCP sender reports; of an \
+                 industrial one, what it answers): images are timed by their arrival"
                     .to_owned(),
             ),
             _ => None,

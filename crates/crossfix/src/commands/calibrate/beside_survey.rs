@@ -1,6 +1,6 @@
 //! Comparison of a calibrated site with its survey.
 
-use crossfix_calibration::{FlightResult, Survey};
+use crossfix_calibration::{FlightResult, Survey, SurveyedPlace, TapedDistance};
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Vector3};
 use serde::Serialize;
@@ -36,27 +36,33 @@ struct BesideDistance {
     deviations: f64,
 }
 
+impl BesidePlace {
+    /// `None` if the flight has not placed the camera.
+    fn of(result: &FlightResult, surveyed: &SurveyedPlace) -> Option<Self> {
+        let beside = centre(result, &surveyed.camera)? - surveyed.position;
+        let deviations = beside.component_div(&surveyed.sd_m).amax();
+        Some(Self { camera: surveyed.camera.to_string(), beside_m: beside.into(), deviations })
+    }
+}
+
+impl BesideDistance {
+    /// `None` if the flight has not placed both cameras.
+    fn of(result: &FlightResult, taped: &TapedDistance) -> Option<Self> {
+        let [first, second] = &taped.between;
+        let longer_m = (centre(result, second)? - centre(result, first)?).norm() - taped.metres;
+        Some(Self {
+            between: taped.between.each_ref().map(ToString::to_string),
+            longer_m,
+            deviations: longer_m.abs() / taped.sd_m,
+        })
+    }
+}
+
 impl BesideSurvey {
     /// Compares the cameras that a flight has placed with a survey.
     pub fn of(result: &FlightResult, survey: &Survey) -> Self {
-        let places = survey.places.iter().filter_map(|place| {
-            let beside = centre(result, &place.camera)? - place.position;
-            let deviations = beside.component_div(&place.sd_m).amax();
-            Some(BesidePlace {
-                camera: place.camera.to_string(),
-                beside_m: beside.into(),
-                deviations,
-            })
-        });
-        let distances = survey.distances.iter().filter_map(|taped| {
-            let [first, second] = &taped.between;
-            let longer_m = (centre(result, second)? - centre(result, first)?).norm() - taped.metres;
-            Some(BesideDistance {
-                between: taped.between.each_ref().map(ToString::to_string),
-                longer_m,
-                deviations: longer_m.abs() / taped.sd_m,
-            })
-        });
+        let places = survey.places.iter().filter_map(|place| BesidePlace::of(result, place));
+        let distances = survey.distances.iter().filter_map(|one| BesideDistance::of(result, one));
         Self { places: places.collect(), distances: distances.collect() }
     }
 
@@ -79,26 +85,25 @@ impl BesideSurvey {
         let first = off.first()?;
         if !self.contradicts() {
             return Some(format!(
-                "The survey has {} elsewhere than the flight, and counted for little: a place that was written \
-                 down for another camera?",
+                "The survey has {} elsewhere than the flight, and counted for little: a place that \
+                 was written down for another camera?",
                 names()
             ));
         }
         let by = Vector3::from(first.beside_m);
-        let is_alike =
-            |place: &&BesidePlace| (Vector3::from(place.beside_m) - by).norm() < 0.1 * by.norm();
+        let distance = |place: &BesidePlace| (Vector3::from(place.beside_m) - by).norm();
         let [east, north, up] = first.beside_m;
-        Some(if off.iter().all(is_alike) {
+        Some(if off.iter().all(|place| distance(place) < 0.1 * by.norm()) {
             format!(
-                "The survey has {} all by the same elsewhere: the flight is {east:+.2}, {north:+.2}, {up:+.2} m \
-                 from it. Log and survey count heights or places from another origin (--height, --geoid, \
-                 --anchor).",
+                "The survey has {} all by the same elsewhere: the flight is {east:+.2}, \
+                 {north:+.2}, {up:+.2} m from it. Log and survey count heights or places from \
+                 another origin (--height, --geoid, --anchor).",
                 names()
             )
         } else {
             format!(
-                "The survey has {} elsewhere than the flight, each by something else: other units, axes, or \
-                 names.",
+                "The survey has {} elsewhere than the flight, each by something else: other units, \
+                 axes, or names.",
                 names()
             )
         })

@@ -8,6 +8,7 @@ use crossfix_recording::Entry;
 use serde::Serialize;
 
 use crate::centre::Centre;
+use crate::commands::examples;
 use crate::config::FusionFile;
 use crate::output;
 use crate::pose_watch::{CameraWatch, TurnText};
@@ -26,9 +27,10 @@ const LEAST_WATCHED_S: f64 = 20.0;
 /// A camera that has been turned by two milliradians is named after a minute of targets that it and
 /// two others see. The exit code is 1 if one does not fit.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix calibrate check last-night.mcap\n  \
-    crossfix calibrate check raw.mcap -c my-site")]
+#[command(after_help = examples(&[
+    "crossfix calibrate check last-night.mcap",
+    "crossfix calibrate check raw.mcap -c my-site",
+]))]
 pub struct Args {
     /// A recording (MCAP) of targets that several cameras see.
     recording: PathBuf,
@@ -135,16 +137,20 @@ fn calibrations(recording: &Path, are_replaced: bool) -> anyhow::Result<Vec<Entr
             && !first.contains_key(name)
         {
             let message = lacks.read::<CameraCalibration>(&entry.data);
-            ensure!(
-                !(are_replaced && message.is_some_and(|message| message.corrects_clock())),
-                "the bearings of {} were made with a flight's calibration: leave -c away to check that",
-                recording.display()
-            );
+            let is_corrected = message.is_some_and(|message| message.corrects_clock());
+            ensure!(!(are_replaced && is_corrected), is_corrected_already(recording));
             first.insert(name.clone(), entry);
         }
         Ok(())
     })?;
     Ok(first.into_values().collect())
+}
+
+fn is_corrected_already(recording: &Path) -> String {
+    format!(
+        "the bearings of {} were made with a flight's calibration: leave -c away to check that",
+        recording.display()
+    )
 }
 
 /// Fuses a recording and watches its cameras.
@@ -239,13 +245,14 @@ impl WatchedCamera {
         let moved_at =
             seen.watch.as_ref().and_then(|watch| watch.moved_at).filter(|_| seen.has_moved);
         let (verdict, why) = match &seen.watch {
-            Some(watch) if let Some(at) = watch.moved_at.filter(|_| seen.has_moved) => {
-                (CameraVerdict::Moved, format!("{}, sure at {at}: calibrate it anew", TurnText(&watch.worst)))
-            }
+            Some(watch) if let Some(at) = watch.moved_at.filter(|_| seen.has_moved) => (
+                CameraVerdict::Moved,
+                format!("{}, sure at {at}: calibrate it anew", TurnText(&watch.worst)),
+            ),
             _ if seen.is_apart() => (
                 CameraVerdict::Apart,
-                "its bearings lie far beside what the others see: its pose, its clock or its name is \
-                 wrong"
+                "its bearings lie far beside what the others see: its pose, its clock or its name \
+                 is wrong"
                     .to_owned(),
             ),
             Some(watch) if watch.watched_s >= LEAST_WATCHED_S => (

@@ -98,8 +98,8 @@ pub fn together(
                 {
                     ensure!(
                         known.at == at,
-                        "landmark `{name}` of camera `{camera}` has another place, or deviation of it, \
-                         than that of camera `{}`: call it otherwise",
+                        "landmark `{name}` of camera `{camera}` has another place, or deviation \
+                         of it, than that of camera `{}`: call it otherwise",
                         known.clicks[0].camera
                     );
                     known.clicks.push(click);

@@ -10,15 +10,17 @@ use serde::Serialize;
 
 use super::plots;
 use crate::calibrated;
+use crate::commands::examples;
 use crate::output;
 
 /// How far two calibrations of one site lie apart.
 ///
-/// What all cameras are off by alike (a log that lay beside) is said apart; the cameras are
-/// compared beside it, over their images.
+/// What all cameras are off by together (an error of the log) is printed separately; the cameras
+/// are compared beside it, over their images.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  \
-    crossfix calibrate compare my-site/calibration.toml my-site/calibration-today.toml")]
+#[command(after_help = examples(&[
+    "crossfix calibrate compare my-site/calibration.toml my-site/calibration-today.toml",
+]))]
 pub struct Args {
     /// A calibration (TOML).
     first: PathBuf,

@@ -15,13 +15,14 @@ const LEFT_OUT_SHARE: f64 = 0.025;
 /// Least side of the volume, m: a flight in one plane gets some air around it. With half of it the
 /// same; without it the volume of a level flight would be empty.
 const LEAST_SIDE_M: f64 = 2.0;
-/// Assumptions as in `plan`: a target is seen for this long, s, and flies straight at this speed,
-/// m/s. With half of the time half as many bearings count; with half of the speed errors of clocks
-/// weigh half as much.
+/// How long a target is assumed to be seen, s, as in `plan`. With half of it half as many bearings
+/// count.
 const WINDOW_S: f64 = 1.0;
+/// Speed at which a target is assumed to fly straight, m/s, as in `plan`. With half of it errors of
+/// clocks weigh half as much.
 const SPEED_MPS: f64 = 15.0;
 /// SD of what is known of its velocity beforehand, m/s per axis: as large as the speed. With half
-/// of it the same where two cameras see the target, as the bearings tell far more.
+/// of it the same where two cameras see the target, as the bearings determine it far better.
 const VELOCITY_PRIOR_MPS: f64 = 15.0;
 
 /// Accuracy of a target's position in the air that the flight passed through.
@@ -71,9 +72,9 @@ impl std::fmt::Display for Cost {
         let [east, north, up] = self.sides_m;
         write!(
             f,
-            "a target in the air that was flown through ({east:.0} x {north:.0} x {up:.0} m, {:.0} % of it \
-             with a fix) will be known to {:.3} m in half of it and to {:.3} m in nine tenths, after {WINDOW_S} s; \
-             by exact cameras to {:.3} m in half of it",
+            "a target in the air that was flown through ({east:.0} x {north:.0} x {up:.0} m, \
+             {:.0} % of it with a fix) will be known to {:.3} m in half of it and to {:.3} m in \
+             nine tenths, after {WINDOW_S} s; by exact cameras to {:.3} m in half of it",
             100.0 * self.fixed,
             self.median_sd_m,
             self.worst_tenth_sd_m,
@@ -82,20 +83,22 @@ impl std::fmt::Display for Cost {
     }
 }
 
+/// Least and greatest coordinate of the box along an axis: the quantiles q and 1 - q of the
+/// target's coordinates, widened where they are too close.
+fn side(mut along: Vec<f64>) -> Option<[f64; 2]> {
+    along.sort_unstable_by(f64::total_cmp);
+    let last = along.len().checked_sub(1)?;
+    let beyond = (LEFT_OUT_SHARE * last as f64) as usize;
+    let (low, high) = (along[beyond], along[last - beyond]);
+    let wider = (0.5 * (LEAST_SIDE_M - (high - low))).max(0.0);
+    Some([low - wider, high + wider])
+}
+
 /// The box around the target's positions.
 fn flown_through(result: &FlightResult) -> Option<Volume> {
     let places =
         || result.cameras.iter().flat_map(|camera| &camera.fitted).map(|label| label.place);
-    let ends = [0, 1, 2].map(|axis| {
-        let mut along: Vec<f64> = places().map(|place| place[axis]).collect();
-        along.sort_unstable_by(f64::total_cmp);
-        let last = along.len().checked_sub(1)?;
-        // Sides of the box: the quantiles q and 1 - q of the positions along the axis.
-        let beyond = (LEFT_OUT_SHARE * last as f64) as usize;
-        let (low, high) = (along[beyond], along[last - beyond]);
-        let wider = (0.5 * (LEAST_SIDE_M - (high - low))).max(0.0);
-        Some([low - wider, high + wider])
-    });
+    let ends = [0, 1, 2].map(|axis| side(places().map(|place| place[axis]).collect()));
     let [Some(east), Some(north), Some(up)] = ends else { return None };
     let corner = |k: usize| Point3::new(east[k], north[k], up[k]);
     Volume::new(corner(0), corner(1), None).ok()

@@ -6,7 +6,7 @@ use crossfix_calibration::{
     CalibratedCamera, CameraLabels, FlightLog, FlightResult, Label, LensFreedom, SiteCalibration,
     Survey, SurveyedLandmark, calibrate_flight,
 };
-use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
+use crossfix_geometry::{Intrinsics, Pixel};
 use crossfix_message::{
     BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
 };
@@ -14,12 +14,14 @@ use crossfix_message::{
 use super::beside_survey::BesideSurvey;
 use super::cost::Cost;
 use super::hold_out::{HeldOut, HoldOut};
-use super::log::{self, LogHeight, LogKind, LogTime, Reading};
+use super::log::{self, LogHeight, LogKind, LogReading, LogTime};
 use super::remarks::{self, Rests};
 use super::report::OfSite;
 use super::survey::{self, Distance};
 use super::{Lens, clicks, compare, picture, plots, report};
 use crate::calibrated;
+use crate::commands::anchor::AnchorArg;
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::output::{self, Draft};
 use crate::recorded::{self, Lacks};
@@ -27,32 +29,25 @@ use crate::recorded::{self, Lacks};
 /// From the flight of one target: with the log of its own receiver, with where cameras stand, or
 /// with landmarks in their pictures.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk \
-    -o my-site/calibration.toml\n  \
-    crossfix calibrate flight REC.mcap --positions survey.csv -o my-site/calibration.toml\n  \
-    crossfix calibrate flight REC.mcap --landmarks points.csv -o my-site/calibration.toml")]
+#[command(after_help = examples(&[
+    "crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml",
+    "crossfix calibrate flight REC.mcap --positions survey.csv -o my-site/calibration.toml",
+    "crossfix calibrate flight REC.mcap --landmarks points.csv -o my-site/calibration.toml",
+]))]
 pub struct Args {
     /// The recording (MCAP) of what the cameras saw.
     recording: PathBuf,
     /// Where the target was by its own receiver: a CSV with time_s and east_m, north_m, up_m, or
-    /// latitude_deg, longitude_deg, height_m; or GPX; or NMEA.
+    /// latitude_deg, longitude_deg, height_m; or GPX; or NMEA. For a log in degrees the site's
+    /// origin is its first position, unless --anchor says otherwise.
     #[arg(
         long,
         value_name = "FILE",
         required_unless_present_any = ["positions", "distance", "landmarks", "prior"]
     )]
     log: Option<PathBuf>,
-    /// Where the site's origin is (WGS84 degrees, and metres above the ellipsoid; above which the
-    /// drone took off with --height takeoff), for a log or landmarks in degrees; the log's first
-    /// place without.
-    #[arg(
-        long,
-        value_name = "LAT,LON,HEIGHT",
-        value_parser = numbers::place,
-        allow_hyphen_values = true
-    )]
-    anchor: Option<Geodetic>,
+    #[command(flatten)]
+    origin: AnchorArg,
     /// What the log's times are: as in the file, or GPS's, which are 18 s ahead of UTC.
     #[arg(long, default_value = "file", value_enum, value_name = "TIME")]
     time: LogTime,
@@ -68,7 +63,7 @@ pub struct Args {
         allow_hyphen_values = true
     )]
     geoid: Option<f64>,
-    /// How far the receiver is above what cameras see as the target's middle, m.
+    /// Height of the receiver above what cameras see as the target's centre, m.
     #[arg(
         long,
         default_value_t = 0.0,
@@ -77,11 +72,12 @@ pub struct Args {
         allow_hyphen_values = true
     )]
     antenna: f64,
-    /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two say how large the
-    /// site is, three where it is; without a log the flight may be anybody's.
+    /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two positions determine
+    /// the size of the site, three also where it is. With them no log is needed, and anything that
+    /// flew will do.
     #[arg(long, value_name = "FILE")]
     positions: Option<PathBuf>,
-    /// How far two cameras are apart, as in north,east,79.3 (m, to 5 cm). May be given again.
+    /// Measured distance between two cameras, as in north,east,79.3 (m, to 5 cm). May be repeated.
     #[arg(long, value_name = "A,B,METRES")]
     distance: Vec<Distance>,
     /// What was clicked in the cameras' pictures: a CSV with camera, landmark, x_px, y_px, east_m,
@@ -89,9 +85,9 @@ pub struct Args {
     /// of the sun and stars. Of the same name is the same thing.
     #[arg(long, value_name = "FILE")]
     landmarks: Option<PathBuf>,
-    /// An earlier calibration (TOML) of the site: what it says of poses and lenses counts as what
-    /// is known. The flight may be anybody's; the difference is printed. Where the site is as a
-    /// whole stays what it says.
+    /// An earlier calibration (TOML) of the site: its poses and lenses, with their uncertainties,
+    /// are the starting point, and the site as a whole stays where it says. Anything that flew will
+    /// do. The differences are printed.
     #[arg(
         long,
         value_name = "FILE",
@@ -101,20 +97,20 @@ pub struct Args {
     /// How good the log is.
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
     log_kind: LogKind,
-    /// Standard deviation of each place in the log, m per axis; the kind's without.
+    /// Standard deviation of each position in the log, m per axis; by default by --log-kind.
     #[arg(long, value_name = "METRES", value_parser = numbers::sd_metres)]
     log_sd: Option<f64>,
-    /// By how much the log may lie beside as a whole, drifting over minutes, m per axis; the
-    /// kind's without.
+    /// Standard deviation of the error that the log has as a whole and that drifts over minutes, m
+    /// per axis; by default by --log-kind.
     #[arg(long, value_name = "METRES", value_parser = numbers::metres_or_none)]
     log_drift: Option<f64>,
-    /// Take what a camera saw from this time of its own on alone, s, as in north=151.
+    /// Use what a camera saw only from this time on, s by its own clock, as in north=151.
     #[arg(long, value_name = "CAMERA=SECONDS")]
-    from: Vec<Moment>,
-    /// Take what a camera saw until this time of its own alone, s.
+    from: Vec<CameraTime>,
+    /// Use what a camera saw only until this time, s by its own clock.
     #[arg(long, value_name = "CAMERA=SECONDS")]
-    to: Vec<Moment>,
-    /// What of the lenses may be otherwise than their files say.
+    to: Vec<CameraTime>,
+    /// Which parameters of the lenses may differ from their files.
     #[arg(long, default_value = "all", value_enum, value_name = "WHAT")]
     lens: Lens,
     /// The calibration (TOML) to write.
@@ -194,7 +190,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 /// What determines the size and position of the calibrated site.
 fn rests(result: &FlightResult, log: Option<&FlightLog>, survey: &Survey) -> Rests {
     let calibrated: Vec<&CameraName> = result.cameras.iter().map(|camera| &camera.name).collect();
-    if log.is_none() || survey.tells_size(&calibrated) {
+    if log.is_none() || survey.determines_size(&calibrated) {
         Rests::OnSurvey
     } else {
         Rests::OnLogAlone
@@ -215,20 +211,21 @@ fn take_out_wrong(result: &mut FlightResult) -> anyhow::Result<()> {
     // The wrong cameras share the log and the fitted trajectory with the others.
     ensure!(
         wrong.len() <= result.cameras.len(),
-        "nothing is written: most cameras are wrong, so the log or the survey is hardly of this flight"
+        "nothing is written: most cameras are wrong, so the log or the survey is hardly of this \
+         flight"
     );
     Ok(())
 }
 
 impl Args {
     /// How the log is to be read.
-    fn reading(&self) -> Reading {
+    fn reading(&self) -> LogReading {
         let mut errors = self.log_kind.errors();
         errors.sd_m = self.log_sd.unwrap_or(errors.sd_m);
         errors.drift_sd_m = self.log_drift.unwrap_or(errors.drift_sd_m);
-        Reading {
+        LogReading {
             errors,
-            anchor: self.anchor,
+            anchor: self.origin.anchor,
             is_gps_time: self.time == LogTime::Gps,
             height: self.height,
             geoid_m: self.geoid,
@@ -238,10 +235,10 @@ impl Args {
 
     /// Restricts what cameras saw to the times that were asked for.
     fn cut(&self, cameras: &mut [CameraLabels]) -> anyhow::Result<()> {
-        for Moment { camera, time_s } in &self.from {
+        for CameraTime { camera, time_s } in &self.from {
             cut(cameras, camera, |label| label.time_s >= *time_s)?;
         }
-        for Moment { camera, time_s } in &self.to {
+        for CameraTime { camera, time_s } in &self.to {
             cut(cameras, camera, |label| label.time_s < *time_s)?;
         }
         Ok(())
@@ -294,7 +291,7 @@ impl Args {
 /// Landmarks clicked in the pictures of the recording's cameras.
 fn landmarks(args: &Args, cameras: &[CameraLabels]) -> anyhow::Result<Vec<SurveyedLandmark>> {
     let Some(path) = &args.landmarks else { return Ok(Vec::new()) };
-    let clicked = clicks::read(path, None, args.anchor)?;
+    let clicked = clicks::read(path, None, args.origin.anchor)?;
     for (name, landmarks) in &clicked {
         if let Some(camera) = cameras.iter().find(|camera| camera.name == *name) {
             clicks::check(landmarks, camera.intrinsics.size)
@@ -306,12 +303,12 @@ fn landmarks(args: &Args, cameras: &[CameraLabels]) -> anyhow::Result<Vec<Survey
 
 /// A time by a camera's own clock, s.
 #[derive(Clone, Debug)]
-struct Moment {
+struct CameraTime {
     camera: CameraName,
     time_s: f64,
 }
 
-impl std::str::FromStr for Moment {
+impl std::str::FromStr for CameraTime {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
@@ -414,6 +411,14 @@ struct RecordedCamera {
 }
 
 impl RecordedCamera {
+    fn of(name: &CameraName, message: &CameraCalibration) -> anyhow::Result<Self> {
+        Ok(Self {
+            lens: message.lens(name)?,
+            is_corrected: message.corrects_clock(),
+            is_on_mount: message.mount.is_some(),
+        })
+    }
+
     /// Checks that an earlier calibration has the same image size, and that it is the one that the
     /// bearings were made with, if they were made with any.
     fn check_against(&self, known: Option<&CalibratedCamera>) -> anyhow::Result<()> {
@@ -428,7 +433,8 @@ impl RecordedCamera {
         }
         ensure!(
             !self.is_corrected || of_prior.is_some_and(|lens| *lens == self.lens),
-            "were made with a calibration, which is not that of --prior: give that with which they were made"
+            "were made with a calibration, which is not that of --prior: \
+             give that with which they were made"
         );
         Ok(())
     }
@@ -442,9 +448,7 @@ fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, RecordedCa
             && !cameras.contains_key(name)
             && let Some(message) = lacks.read::<CameraCalibration>(&entry.data)
         {
-            let is_corrected = message.corrects_clock();
-            let (lens, is_on_mount) = (message.lens(name)?, message.mount.is_some());
-            cameras.insert(name.clone(), RecordedCamera { lens, is_corrected, is_on_mount });
+            cameras.insert(name.clone(), RecordedCamera::of(name, &message)?);
         }
         Ok(())
     })?;

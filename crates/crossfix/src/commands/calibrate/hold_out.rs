@@ -29,8 +29,8 @@ pub enum HoldOut {
     Blocks,
 }
 
-/// Length of a block, s. Tracks begin anew in each: with half of it they would be missing for twice
-/// as large a share of the time.
+/// Length of a block, s. Tracks start again in each: with half of it they would be missing for
+/// twice as large a share of the time.
 const BLOCK_S: f64 = 10.0;
 /// Log positions count where at least this many cameras see the target. With two, places near the
 /// line through both would count, where no calibration helps.
@@ -75,7 +75,7 @@ impl HeldOut {
     }
 
     fn common_s(&self, camera: &CameraName, own_s: f64) -> Option<f64> {
-        Some(own_s + self.clocks.get(camera)?.at(own_s).0)
+        Some(own_s + self.clocks.get(camera)?.at(own_s).ahead_s)
     }
 
     fn holds(&self, camera: &CameraName, own_s: f64) -> bool {
@@ -182,13 +182,9 @@ impl HeldOutRun {
     }
 
     fn worth(&self, log: Option<&FlightLog>) -> Worth {
-        let mean = |(camera, (sum, count)): (&String, &(f64, u32))| {
-            (camera.clone(), sum / f64::from(*count))
-        };
-        Worth {
-            against_log: log.map(|log| self.against(log)),
-            mean_nis: self.innovations.iter().map(mean).collect(),
-        }
+        let sums = self.innovations.iter();
+        let mean_nis = sums.map(|(camera, (sum, n))| (camera.clone(), sum / f64::from(*n)));
+        Worth { against_log: log.map(|log| self.against(log)), mean_nis: mean_nis.collect() }
     }
 
     /// The tracks compared with the log, whose own variance is added to the tracks' covariances.
@@ -265,8 +261,8 @@ impl fmt::Display for Worth {
             }
             Some(log) => write!(
                 f,
-                " tracks at {:.1} % of {} places of the log, half of them within {} m and 95 % within {} m \
-                 of it, NEES {} in the median (2.4 is honest);",
+                " tracks at {:.1} % of {} places of the log, half of them within {} m and 95 % \
+                 within {} m of it, NEES {} in the median (2.4 is honest);",
                 100.0 * log.found,
                 log.places,
                 output::number(log.median_m, 3),

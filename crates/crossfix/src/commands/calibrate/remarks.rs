@@ -43,16 +43,14 @@ pub enum Rests {
 
 /// All remarks on a result.
 pub fn of(result: &FlightResult, rests: Rests) -> Vec<String> {
-    let times: Vec<ClockAgainstLog> = result.cameras.iter().map(ClockAgainstLog::of).collect();
-    let of_times = |say: fn(&[ClockAgainstLog]) -> Option<String>| {
-        result.log.is_some().then(|| say(&times)).flatten()
-    };
+    let clocks: Option<Vec<ClockAgainstLog>> =
+        result.log.map(|_| result.cameras.iter().map(ClockAgainstLog::of).collect());
     [
         of_log(result),
         of_size(rests),
         of_landmarks(&result.landmarks),
-        of_times(of_offsets),
-        of_times(of_rates),
+        clocks.as_deref().and_then(of_offsets),
+        clocks.as_deref().and_then(of_rates),
         of_lenses(result),
     ]
     .into_iter()
@@ -63,8 +61,8 @@ pub fn of(result: &FlightResult, rests: Rests) -> Vec<String> {
 fn of_size(rests: Rests) -> Option<String> {
     (rests == Rests::OnLogAlone).then(|| {
         "Where the site is and how large rests on the log alone: feet for metres, or heights over \
-         another sea, would not show. Places of two cameras (--positions) or a taped --distance would \
-         tell."
+         another sea, would not show. Places of two cameras (--positions) or a taped --distance \
+         would tell."
             .to_owned()
     })
 }
@@ -94,8 +92,9 @@ fn of_landmarks(landmarks: &[LandmarkMisfit]) -> Option<String> {
     }
     if most_lie_beside(landmarks) {
         return Some(
-            "Most landmarks lie beside where the flight has them: their places or the log's are in feet, \
-             count from another origin or have a wrong sign, or pictures were taken before a camera was \
+            "Most landmarks lie beside where the flight has them: their places or the log's are in \
+             feet, count from another origin or have a wrong sign, or pictures were taken before a \
+             camera was \
              moved. Of few landmarks one wrong place may do that."
                 .to_owned(),
         );
@@ -103,8 +102,8 @@ fn of_landmarks(landmarks: &[LandmarkMisfit]) -> Option<String> {
     let name = |misfit: &&LandmarkMisfit| format!("`{}` of `{}`", misfit.landmark, misfit.camera);
     let names: Vec<String> = beside.iter().map(name).collect();
     Some(format!(
-        "Beside where the flight and the other landmarks have it, and so counted for less: {}. A wrong \
-         click, or another's place.",
+        "Beside where the flight and the other landmarks have it, and so counted for less: {}. A \
+         wrong click, or another's place.",
         names.join(", ")
     ))
 }
@@ -139,8 +138,8 @@ fn of_rates(clocks: &[ClockAgainstLog]) -> Option<String> {
     (rate.abs() > REMARKED_RATE).then(|| {
         let word = if rate > 0.0 { "fast" } else { "slow" };
         format!(
-            "The log's clock runs {:.2} % {word} against the cameras', which agree among themselves: \
-             its times are hardly seconds.",
+            "The log's clock runs {:.2} % {word} against the cameras', which agree among \
+             themselves: its times are hardly seconds.",
             100.0 * rate.abs()
         )
     })
@@ -170,8 +169,8 @@ fn of_offsets(clocks: &[ClockAgainstLog]) -> Option<String> {
 fn of_lenses(result: &FlightResult) -> Option<String> {
     let moved = |camera: &CameraResult| (camera.focal_ratio - 1.0).abs() > REMARKED_FOCAL;
     result.cameras.iter().any(moved).then(|| {
-        "A lens's focal length is shorter or longer at a distance than near the checkerboard that its \
-         file was made with: that is usual up to 2 %."
+        "A lens's focal length is shorter or longer at a distance than near the checkerboard that \
+         its file was made with: that is usual up to 2 %."
             .to_owned()
     })
 }

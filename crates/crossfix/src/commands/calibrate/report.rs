@@ -97,12 +97,14 @@ struct DatumFigures {
 /// mrad, s. With half of it the same: what nothing determines keeps SDs that are far above.
 const UNKNOWN: [f64; 3] = [100.0, 1e3, 10.0];
 
+/// The text of a figure with its SD, if the SD is less than that of something `unknown`.
+fn known(sd: f64, unknown: f64, text: String) -> String {
+    if sd < unknown { text } else { "not known".to_owned() }
+}
+
 impl std::fmt::Display for DatumFigures {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let largest = |values: [f64; 3]| values.into_iter().fold(0.0, f64::max);
-        let known = |value: f64, unknown: f64, text: String| {
-            if value < unknown { text } else { "not known".to_owned() }
-        };
         let (position_m, turn_mrad) = (largest(self.position_sd_m), largest(self.turn_sd_mrad));
         write!(
             f,
@@ -182,10 +184,11 @@ pub fn without_wrong(result: &FlightResult) -> FlightResult {
 
 /// Removes wrong cameras from a result, and returns their names.
 pub fn take_out_wrong(result: &mut FlightResult) -> Vec<CameraName> {
-    let is_wrong = |camera: &mut CameraResult| {
-        CameraFigures::from(&*camera).verdict.starts_with(verdict::WRONG)
-    };
-    result.cameras.extract_if(.., is_wrong).map(|camera| camera.name).collect()
+    result.cameras.extract_if(.., |camera| is_wrong(camera)).map(|camera| camera.name).collect()
+}
+
+fn is_wrong(camera: &CameraResult) -> bool {
+    CameraFigures::from(camera).verdict.starts_with(verdict::WRONG)
 }
 
 impl From<&CameraResult> for CameraFigures {
@@ -197,8 +200,10 @@ impl From<&CameraResult> for CameraFigures {
         let covariance = &camera.pose_covariance;
         let position_sd_m = covariance.fixed_view::<3, 3>(3, 3).trace().sqrt();
         let pointing_sd_mrad = covariance.fixed_view::<3, 3>(0, 0).trace().sqrt() * 1e3;
+        let pose_sd =
+            verdict::PoseSd { position_m: position_sd_m, pointing_mrad: pointing_sd_mrad };
         Self {
-            verdict: verdict::of(camera, [position_sd_m, pointing_sd_mrad], wander_ms),
+            verdict: verdict::of(camera, pose_sd, wander_ms),
             name: camera.name.to_string(),
             labels: camera.labels,
             used: camera.used,
@@ -266,8 +271,8 @@ pub fn render(result: &FlightResult, figures: &Figures) -> String {
         .collect();
     let log = result.log.map_or_else(String::new, |log| {
         format!(
-            "\n\nthe log lies {:.3} m beside the way, root mean square per axis; {} of its {} places lie \
-             farther off and are left out",
+            "\n\nthe log lies {:.3} m beside the way, root mean square per axis; \
+             {} of its {} places lie farther off and are left out",
             log.residual_m, log.left_out, log.samples
         )
     });

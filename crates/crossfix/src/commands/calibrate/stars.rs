@@ -9,8 +9,8 @@ use crossfix_calibration::{
 };
 use crossfix_geometry::{CameraModel, Distortion, Geodetic, Pixel};
 use crossfix_message::Timestamp;
-use crossfix_stars::{NamedStar, Observer, Picture, Sky, Spot, find_spots, star_sd_rad};
-use crossfix_video::{CaptureTime, Frame, decode_still};
+use crossfix_stars::{NamedStar, Observer, Sky, Spot, StarPicture, find_spots, star_sd_rad};
+use crossfix_video::{CaptureTime, Frame, Still, decode_still};
 use nalgebra::{Point3, Unit, Vector3};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
@@ -23,7 +23,7 @@ pub struct NightArgs {
     /// The camera's picture of the night sky (PNG or JPEG): its stars are found and named.
     #[arg(long, value_name = "PICTURE", requires_all = ["camera", "time", "catalogue", "anchor"])]
     pub stars: Option<PathBuf>,
-    /// When it was taken, the middle of the exposure, as 2026-11-24T21:30:00Z.
+    /// When the picture was taken: the middle of the exposure, as 2026-11-24T21:30:00Z.
     #[arg(long, value_name = "UTC", value_parser = time, requires = "stars")]
     time: Option<Timestamp>,
     /// How well that is known, s (standard deviation): stars turn by 0.07 mrad in a second.
@@ -65,12 +65,12 @@ const FEWEST_STARS: usize = 12;
 /// twice as much the sky may be turned against the landmarks by 0.3 mrad (SD), which the lens would
 /// be bent for.
 const MOST_BESIDE_PLACES_S: f64 = 2.0;
-/// Lens models leave errors of less than this, pixels, ...
+/// Lens models leave errors of less than this, pixels. With half of it the errors that every model
+/// leaves would count as those of another lens.
 const LEAST_BENT_PX: f64 = 0.25;
-/// ... and a lens error shows as a correlation of at least this between neighbouring stars'
-/// residuals. With half of the pixels the errors that every model leaves would be taken for another
-/// lens.
-const LEAST_ALIKE: f64 = 0.3;
+/// An error of the lens shows as a correlation of at least this between the residuals of
+/// neighbouring stars. With half of it chance would do in a picture of few stars.
+const LEAST_NEIGHBOUR_CORRELATION: f64 = 0.3;
 /// Distance at which pointing is evaluated for stars, m: so far away that the camera's position
 /// does not count. With half of it the same.
 const DISTANT_M: f64 = 1e9;
@@ -81,11 +81,12 @@ const MOST_RESCALED: usize = 8;
 /// known in more of the image. With half as many, stars near the edges might not be named if the
 /// lens begins far off.
 const MOST_ROUNDS: usize = 10;
-/// Stars are looked for within this many SDs of their predicted pixel, ...
+/// Stars are looked for within this many SDs of their predicted pixel. With half of it one star in
+/// seven would be missed where the lens is not well known.
 const GATE: f64 = 4.0;
-/// ... but at least and at most within these distances, pixels: a spot that is not round is found
-/// beside its centre, and farther away than the most there are other stars. With half of the SDs
-/// one star in seven would be missed where the lens is not well known.
+/// Least and greatest distance within which stars are looked for, pixels: a spot that is not round
+/// is found beside its centre, and farther away than the greatest there are other stars. With half
+/// of the greatest a lens that is off by more cannot be found.
 const GATES_PX: std::ops::RangeInclusive<f64> = 2.0..=40.0;
 
 /// Finds and identifies the stars of a camera's picture and adds them to its landmarks. Many stars
@@ -105,7 +106,8 @@ pub fn add(
     };
     ensure!(
         picture.landmarks.is_empty() || args.time_sd <= MOST_BESIDE_PLACES_S,
-        "beside landmarks the time of the stars must be known to {MOST_BESIDE_PLACES_S} s (--time-sd)"
+        "beside landmarks the time of the stars must be known to {MOST_BESIDE_PLACES_S} s \
+         (--time-sd)"
     );
     let observer = Observer { place: anchor.context("--anchor is missing")?, time: *time };
     if picture.freedom == LensFreedom::All {
@@ -129,15 +131,17 @@ pub fn add(
     }
     ensure!(
         !fitted.bends_otherwise(),
-        "stars beside each other lie {:.1} pixels beside where the lens has them, to the same side: it is another \
-         than in its file; let it be otherwise (--lens all), or take the file of this model, resolution and zoom",
+        "stars beside each other lie {:.1} pixels beside where the lens has them, to the same \
+         side: it is another than in its file; let it be otherwise (--lens all), or take the file \
+         of this model, resolution and zoom",
         fitted.sd_px
     );
     let middle = fitted.stars.iter().map(|star| star.direction.into_inner()).sum::<Vector3<f64>>();
     picture.sky_turn = observer.turn(&Unit::new_normalize(middle), args.time_sd).covariance;
     picture.landmarks.extend(landmarks(&fitted.stars, fitted.sd_px));
     tracing::info!(
-        "camera `{}`: {} of {} spots in the picture are stars with a name; they fit to {:.2} pixels",
+        "camera `{}`: {} of {} spots in the picture are stars with a name; they fit to {:.2} \
+         pixels",
         picture.camera,
         fitted.stars.len(),
         spots.len(),
@@ -147,7 +151,7 @@ pub fn add(
 }
 
 fn spots(path: &PathBuf, model: &CameraModel) -> anyhow::Result<Vec<Spot>> {
-    let (width, height, pixels) =
+    let Still { width, height, pixels } =
         decode_still(&std::fs::read(path)?).map_err(anyhow::Error::msg)?;
     let size = model.intrinsics().size;
     ensure!(
@@ -159,8 +163,11 @@ fn spots(path: &PathBuf, model: &CameraModel) -> anyhow::Result<Vec<Spot>> {
     let capture = CaptureTime { time: Timestamp::EPOCH, sd_s: 0.0 };
     let frame = Frame { index: 0, capture, live: None, width, height, pixels };
     let brightness = frame.brightness();
-    let mut spots =
-        find_spots(&Picture { width: size.width, height: size.height, brightness: &brightness })?;
+    let mut spots = find_spots(&StarPicture {
+        width: size.width,
+        height: size.height,
+        brightness: &brightness,
+    })?;
     let count = spots.len();
     spots.retain(|spot| model.direction(spot.pixel).is_ok());
     if spots.len() < count {
@@ -208,8 +215,8 @@ impl Fitted {
                 _ => {
                     ensure!(
                         found < MOST_SD_PX,
-                        "the stars of the picture lie {found:.1} pixels beside where they should: is the \
-                         lens (file, resolution, zoom) that of the picture?"
+                        "the stars of the picture lie {found:.1} pixels beside where they should: \
+                         is the lens (file, resolution, zoom) that of the picture?"
                     );
                     return Ok(Self { stars, result, sd_px: found });
                 }
@@ -230,7 +237,8 @@ impl Fitted {
         // For white errors it is 0, with an SD of one over the root of their number; four SDs are
         // allowed.
         let by_chance = 4.0 / (2.0 * fits.len() as f64).sqrt();
-        self.sd_px > LEAST_BENT_PX && products / squares > by_chance.max(LEAST_ALIKE)
+        self.sd_px > LEAST_BENT_PX
+            && products / squares > by_chance.max(LEAST_NEIGHBOUR_CORRELATION)
     }
 
     /// A star's residual times that of the star nearest to it, as a scalar product.

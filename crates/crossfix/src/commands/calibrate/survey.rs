@@ -97,15 +97,9 @@ fn read_places(path: &Path) -> anyhow::Result<Vec<SurveyedPlace>> {
     let mut reader =
         csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).with_context(wrong)?;
     let mut places: Vec<SurveyedPlace> = Vec::new();
-    for (row, record) in reader.deserialize::<SurveyRow>().enumerate() {
-        let place = record.with_context(wrong)?.place().with_context(|| {
-            format!(
-                "the survey {}, row {}: camera, east_m, north_m, up_m and sd_m (or sd_east_m, \
-                 sd_north_m and sd_up_m, from 0.0001) are wanted, in metres",
-                path.display(),
-                row + 2
-            )
-        })?;
+    for (index, record) in reader.deserialize::<SurveyRow>().enumerate() {
+        let row = record.with_context(wrong)?;
+        let place = row.place().with_context(|| columns_wanted(path, index + 2))?;
         ensure!(
             places.iter().all(|known| known.camera != place.camera),
             "the survey {} has camera `{}` twice",
@@ -116,4 +110,13 @@ fn read_places(path: &Path) -> anyhow::Result<Vec<SurveyedPlace>> {
     }
     ensure!(!places.is_empty(), "the survey {} has no rows", path.display());
     Ok(places)
+}
+
+/// What a line of the survey must hold, where it does not.
+fn columns_wanted(path: &Path, line: usize) -> String {
+    format!(
+        "the survey {}, row {line}: camera, east_m, north_m, up_m and sd_m (or sd_east_m, \
+         sd_north_m and sd_up_m, from 0.0001) are wanted, in metres",
+        path.display(),
+    )
 }

@@ -74,7 +74,7 @@ impl Drop for Component {
     }
 }
 
-/// What hears the cameras.
+/// What receives the cameras' messages.
 pub(super) struct CentreProcesses {
     recorder: Component,
     fusion: Component,

@@ -3,13 +3,15 @@
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use super::{Finding, Verdict};
+use super::{CheckResult, Finding};
 use crate::host::kernel_clock_bound;
 use crate::pace::wall_seconds;
 
-/// How long a program may take to answer, and how often it is checked whether it has. With half of
-/// it the programs of a busy host may seem to be absent.
+/// How long a program may take to answer. With half of it the programs of a busy host may seem to
+/// be absent.
 const ANSWER: Duration = Duration::from_secs(5);
+/// How often it is checked whether a program has answered. With twice as much each check of a clock
+/// takes up to 10 ms longer.
 const POLL: Duration = Duration::from_millis(10);
 /// A good clock's error is at most this, s: a target at 20 m/s is then off by a tenth of a metre.
 /// With twice as much a fifth of a metre would pass.
@@ -50,13 +52,13 @@ impl ChronyTracking {
 
     /// Judges the clock by its error bound by now and by when it was compared: chrony says "Normal"
     /// as long as it runs, even if its server is dead.
-    fn judge(&self, now_s: f64) -> (Verdict, String) {
+    fn assess(&self, now_s: f64) -> (CheckResult, String) {
         if !self.is_synchronised {
-            return (Verdict::Fail, "chrony runs, and has no time server".to_owned());
+            return (CheckResult::Fail, "chrony runs, and has no time server".to_owned());
         }
         let age_s = now_s - self.compared_s;
         let verdict = match of_bound(self.bound_s) {
-            Verdict::Pass if age_s > OLD_S => Verdict::Warn,
+            CheckResult::Pass if age_s > OLD_S => CheckResult::Warn,
             verdict => verdict,
         };
         let found = format!(
@@ -91,7 +93,7 @@ impl Ptp {
         })
     }
 
-    fn judge(&self) -> (Verdict, String) {
+    fn assess(&self) -> (CheckResult, String) {
         let off_s = self.offset_s.abs();
         let found = format!("by PTP's grandmaster {}, {:.1} us off", self.grandmaster, off_s * 1e6);
         (of_bound(off_s), found)
@@ -99,13 +101,13 @@ impl Ptp {
 }
 
 /// Verdict on a clock with this error bound.
-fn of_bound(bound_s: f64) -> Verdict {
+fn of_bound(bound_s: f64) -> CheckResult {
     if bound_s > BEARABLE_S {
-        Verdict::Fail
+        CheckResult::Fail
     } else if bound_s > GOOD_S {
-        Verdict::Warn
+        CheckResult::Warn
     } else {
-        Verdict::Pass
+        CheckResult::Pass
     }
 }
 
@@ -128,27 +130,27 @@ fn said(program: &str, arguments: &[&str]) -> Option<String> {
     Some(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Accuracy of this host's clock: by the program that disciplines it, or by what that has told the
-/// kernel.
+/// Accuracy of this host's clock: by the program that disciplines it, or by what that has set in
+/// the kernel.
 pub fn host_clock() -> Finding {
     let chrony = || ChronyTracking::parse(&said("chronyc", &["-c", "tracking"])?);
     let ptp = || Ptp::parse(&said("pmc", &["-u", "-b", "0", "GET TIME_STATUS_NP"])?);
     let (chrony, kernel) = (chrony(), kernel_clock_bound());
     let keeps = |tracking: &&ChronyTracking| tracking.is_synchronised || kernel.is_none();
     let (verdict, found) = if let Some(tracking) = chrony.as_ref().filter(keeps) {
-        tracking.judge(wall_seconds())
-    // ptp4l disciplines a network card's clock; it is this host's only if the kernel was told of
+        tracking.assess(wall_seconds())
+    // ptp4l disciplines a network card's clock; it is this host's only if the kernel knows of
     // it.
     } else if let (Some(ptp), Some(_)) = (ptp(), kernel) {
-        ptp.judge()
+        ptp.assess()
     } else if let Some(bound) = kernel {
         let bound_s = bound.as_secs_f64();
         (of_bound(bound_s), format!("within {:.1} ms, as the kernel was told", bound_s * 1e3))
     } else {
-        (Verdict::Warn, "nothing here keeps it".to_owned())
+        (CheckResult::Warn, "nothing here keeps it".to_owned())
     };
     Finding::new("host clock", verdict, found)
-        .mend("run chrony, with the time server that the cameras have: apt-get install chrony")
+        .remedy("run chrony, with the time server that the cameras have: apt-get install chrony")
 }
 
 #[cfg(test)]
@@ -157,20 +159,20 @@ mod tests {
 
     const NOW_S: f64 = 1_795_000_100.0;
 
-    fn judged(offset: &str, delay: &str, dispersion: &str, leap: &str) -> Verdict {
+    fn verdict_of(offset: &str, delay: &str, dispersion: &str, leap: &str) -> CheckResult {
         let line = format!(
             "7F7F0101,10.0.0.1,3,1795000000.0,{offset},0.000001,0.00001,-1.2,0.0,0.1,{delay},{dispersion},64.5,{leap}\n"
         );
-        ChronyTracking::parse(&line).unwrap().judge(NOW_S).0
+        ChronyTracking::parse(&line).unwrap().assess(NOW_S).0
     }
 
     #[test]
     fn a_clock_is_judged_by_what_it_may_be_off_and_not_by_what_it_calls_itself() {
-        assert_eq!(judged("-0.0001", "0.002", "0.0005", "Normal"), Verdict::Pass);
-        assert_eq!(judged("0.0001", "0.02", "0.0005", "Normal"), Verdict::Warn);
+        assert_eq!(verdict_of("-0.0001", "0.002", "0.0005", "Normal"), CheckResult::Pass);
+        assert_eq!(verdict_of("0.0001", "0.02", "0.0005", "Normal"), CheckResult::Warn);
         // Its server is dead, and only the dispersion shows it.
-        assert_eq!(judged("0.0001", "0.002", "0.9", "Normal"), Verdict::Fail);
-        assert_eq!(judged("0.0", "0.0", "0.0", "Not synchronised"), Verdict::Fail);
+        assert_eq!(verdict_of("0.0001", "0.002", "0.9", "Normal"), CheckResult::Fail);
+        assert_eq!(verdict_of("0.0", "0.0", "0.0", "Not synchronised"), CheckResult::Fail);
     }
 
     #[test]
@@ -182,12 +184,12 @@ mod tests {
                  gmIdentity                 525400.fffe.123456\n"
             )
         };
-        let judged = |offset: &str| Ptp::parse(&said(offset, "true")).unwrap().judge();
-        let (verdict, found) = judged("-500");
-        assert_eq!(verdict, Verdict::Pass);
+        let verdict_of = |offset: &str| Ptp::parse(&said(offset, "true")).unwrap().assess();
+        let (verdict, found) = verdict_of("-500");
+        assert_eq!(verdict, CheckResult::Pass);
         assert_eq!(found, "by PTP's grandmaster 525400.fffe.123456, 0.5 us off");
-        assert_eq!(judged("20000000").0, Verdict::Warn);
-        assert_eq!(judged("-37000000000").0, Verdict::Fail);
+        assert_eq!(verdict_of("20000000").0, CheckResult::Warn);
+        assert_eq!(verdict_of("-37000000000").0, CheckResult::Fail);
         assert_eq!(Ptp::parse(&said("0", "false")), None);
         assert_eq!(Ptp::parse("sending: GET TIME_STATUS_NP\n"), None);
     }

@@ -15,6 +15,7 @@ use crossfix_video::decoding_time;
 use serde::Serialize;
 
 use super::sources::{Tried, try_out};
+use crate::commands::examples;
 use crate::config::{self, CameraFile, FileKind, OnvifConfig, load_network};
 #[cfg(feature = "onvif")]
 use crate::onvif;
@@ -28,7 +29,7 @@ const WATCHED_S: f64 = 8.0;
 /// twice as much only half of the interval would be left for that.
 const DECODING_SHARE: f64 = 0.25;
 /// Images more than this many intervals apart have been delayed on the way. With half of it a
-/// single lost image would be taken for a delay.
+/// single lost image would count as a delay.
 const HELD_UP: f64 = 4.0;
 /// Share of images whose loss is acceptable. With half of it the same: of 240 images in eight
 /// seconds one is four times as much.
@@ -37,14 +38,15 @@ const BEARABLE_LOSS: f64 = 0.001;
 /// With half of it a camera that takes 0.3 s for an image would be suspected.
 const LATEST_S: f64 = 0.5;
 
-/// Find out what keeps a camera host or a site from working, and how to mend it.
+/// Find out what keeps a camera host or a site from working, and how to fix it.
 ///
 /// Of a camera's file: the camera and what it sends, its clock and this host's, the decoder, the
 /// port. Of the network's or the fusion centre's: who can be reached.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix doctor -c configs/site/north.toml\n  \
-    crossfix doctor -c configs/site/network.toml")]
+#[command(after_help = examples(&[
+    "crossfix doctor -c configs/site/north.toml",
+    "crossfix doctor -c configs/site/network.toml",
+]))]
 pub struct Args {
     /// A file of the site (TOML): a camera's, the fusion centre's, the network's.
     #[arg(short, long, value_name = "FILE")]
@@ -57,13 +59,13 @@ pub struct Args {
 /// Verdict on one finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-enum Verdict {
+enum CheckResult {
     Pass,
     Warn,
     Fail,
 }
 
-impl fmt::Display for Verdict {
+impl fmt::Display for CheckResult {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
             Self::Pass => "pass",
@@ -77,21 +79,22 @@ impl fmt::Display for Verdict {
 #[derive(Clone, Debug, Serialize)]
 struct Finding {
     what: String,
-    verdict: Verdict,
+    verdict: CheckResult,
     found: String,
     /// What to do about it; nothing for what passes.
     #[serde(skip_serializing_if = "Option::is_none")]
-    mend: Option<String>,
+    #[serde(rename = "mend")]
+    remedy: Option<String>,
 }
 
 impl Finding {
-    fn new(what: impl Into<String>, verdict: Verdict, found: impl Into<String>) -> Self {
-        Self { what: what.into(), verdict, found: found.into(), mend: None }
+    fn new(what: impl Into<String>, verdict: CheckResult, found: impl Into<String>) -> Self {
+        Self { what: what.into(), verdict, found: found.into(), remedy: None }
     }
 
-    fn mend(self, how: impl Into<String>) -> Self {
-        let mend = (self.verdict != Verdict::Pass).then(|| how.into());
-        Self { mend, ..self }
+    fn remedy(self, how: impl Into<String>) -> Self {
+        let remedy = (self.verdict != CheckResult::Pass).then(|| how.into());
+        Self { remedy, ..self }
     }
 }
 
@@ -121,7 +124,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     let failed: Vec<&str> = findings
         .iter()
-        .filter(|finding| finding.verdict == Verdict::Fail)
+        .filter(|finding| finding.verdict == CheckResult::Fail)
         .map(|finding| finding.what.as_str())
         .collect();
     ensure!(failed.is_empty(), "not ready: {}", failed.join(", "));
@@ -129,25 +132,25 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 fn print(finding: &Finding) {
-    let Finding { what, verdict, found, mend } = finding;
+    let Finding { what, verdict, found, remedy } = finding;
     output::line(format!("{verdict:4}  {what:14} {found}"));
-    if let Some(mend) = mend {
-        output::line(format!("      {:14} -> {mend}", ""));
+    if let Some(remedy) = remedy {
+        output::line(format!("      {:14} -> {remedy}", ""));
     }
 }
 
 fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     let file = CameraFile::load(path, &[])?;
     let camera = file.camera(path)?;
-    let mut findings = vec![Finding::new("files", Verdict::Pass, path.display().to_string())];
+    let mut findings = vec![Finding::new("files", CheckResult::Pass, path.display().to_string())];
     match file.live(Some(camera.model().intrinsics().size))? {
         Some(live) => {
             let (tried, _) = try_out(live, WATCHED_S);
             findings.extend(of_stream(&tried, &camera, file.clock.offset_s));
         }
         None => findings.push(match file.check_pictures(&camera) {
-            Ok(()) => Finding::new("pictures", Verdict::Pass, "can be read"),
-            Err(error) => Finding::new("pictures", Verdict::Fail, format!("{error:#}")),
+            Ok(()) => Finding::new("pictures", CheckResult::Pass, "can be read"),
+            Err(error) => Finding::new("pictures", CheckResult::Fail, format!("{error:#}")),
         }),
     }
     if let Some(onvif) = file.mount.as_ref().and_then(|mount| mount.onvif.as_ref()) {
@@ -157,12 +160,12 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     let network = load_network(&file.network)?;
     findings.push(match network.cameras.get(&file.name) {
         Some(_) if network.mode == Mode::Client => {
-            Finding::new("endpoint", Verdict::Pass, "none: it connects to a router")
+            Finding::new("endpoint", CheckResult::Pass, "none: it connects to a router")
         }
         Some(endpoint) => of_own_endpoint(endpoint),
         None => {
             let found = format!("camera `{}` has no endpoint in the network's file", file.name);
-            Finding::new("endpoint", Verdict::Fail, found).mend("give it a line in [cameras]")
+            Finding::new("endpoint", CheckResult::Fail, found).remedy("give it a line in [cameras]")
         }
     });
     let identity = Identity::Camera(file.name);
@@ -179,40 +182,40 @@ fn of_mount(mount: &OnvifConfig) -> Finding {
     match asked {
         Ok(onvif::Described { name, position: Some([pan, tilt]), .. }) => {
             let found = format!("{name} says pan {pan}, tilt {tilt}");
-            Finding::new("mount", Verdict::Pass, found)
+            Finding::new("mount", CheckResult::Pass, found)
         }
-        Ok(_) => Finding::new("mount", Verdict::Fail, "it does not say where it points")
-            .mend("bearings need its angles: another mount, or none"),
-        Err(error) => Finding::new("mount", Verdict::Fail, format!("{error:#}"))
-            .mend(format!("try it by `crossfix sources {}`", mount.url)),
+        Ok(_) => Finding::new("mount", CheckResult::Fail, "it does not say where it points")
+            .remedy("bearings need its angles: another mount, or none"),
+        Err(error) => Finding::new("mount", CheckResult::Fail, format!("{error:#}"))
+            .remedy(format!("try it by `crossfix sources {}`", mount.url)),
     }
 }
 
 /// The finding of a build without ONVIF, which cannot ask the mount.
 #[cfg(not(feature = "onvif"))]
 fn of_mount(_: &OnvifConfig) -> Finding {
-    Finding::new("mount", Verdict::Fail, "this build leaves out mounts by ONVIF")
-        .mend("build it with `--features onvif`")
+    Finding::new("mount", CheckResult::Fail, "this build leaves out mounts by ONVIF")
+        .remedy("build it with `--features onvif`")
 }
 
 /// Findings on a watched stream; the camera's clock is declared to be `ahead_s` ahead.
 fn of_stream(tried: &Tried, camera: &Camera, ahead_s: f64) -> Vec<Finding> {
     if tried.frames == 0 {
         let found = tried.troubles.first().cloned().unwrap_or_else(|| "sends nothing".to_owned());
-        let mend = "try it by `crossfix sources`, or any player: ffplay, vlc";
-        return vec![Finding::new("camera", Verdict::Fail, found).mend(mend)];
+        let remedy = "try it by `crossfix sources`, or any player: ffplay, vlc";
+        return vec![Finding::new("camera", CheckResult::Fail, found).remedy(remedy)];
     }
     let sends = format!("{}x{}, {:.2} a second", tried.width, tried.height, tried.rate_hz);
     let size = camera.model().intrinsics().size;
     let fits = (tried.width, tried.height) == (size.width as usize, size.height as usize);
     let lens = Finding::new(
         "lens",
-        if fits { Verdict::Pass } else { Verdict::Fail },
+        if fits { CheckResult::Pass } else { CheckResult::Fail },
         format!("the intrinsics are for {}x{}", size.width, size.height),
     );
     vec![
-        Finding::new("camera", Verdict::Pass, sends),
-        lens.mend(
+        Finding::new("camera", CheckResult::Pass, sends),
+        lens.remedy(
             "calibrate at the size of the video, or set the camera to that of the intrinsics",
         ),
         of_way(tried),
@@ -227,7 +230,7 @@ fn of_way(tried: &Tried) -> Finding {
     let share = lost as f64 / (tried.frames + lost) as f64;
     let held_up = tried.longest_interval_s * tried.rate_hz > HELD_UP;
     let is_good = share <= BEARABLE_LOSS && !held_up && tried.troubles.is_empty();
-    let verdict = if is_good { Verdict::Pass } else { Verdict::Warn };
+    let verdict = if is_good { CheckResult::Pass } else { CheckResult::Warn };
     let trouble = tried.troubles.first().map(|trouble| format!("{trouble}; "));
     let found = trouble.unwrap_or_default()
         + &format!(
@@ -237,7 +240,7 @@ fn of_way(tried: &Tried) -> Finding {
             tried.longest_interval_s * 1e3
         );
     Finding::new("way", verdict, found)
-        .mend("a cable in the place of radio; fewer bits a second; transport = \"tcp\"")
+        .remedy("a cable in the place of radio; fewer bits a second; transport = \"tcp\"")
 }
 
 fn of_camera_clock(tried: &Tried, declared_s: f64) -> Finding {
@@ -245,7 +248,7 @@ fn of_camera_clock(tried: &Tried, declared_s: f64) -> Finding {
     match (tried.camera_ahead_s, tried.arrival_after_capture_s) {
         (Some(ahead_s), _) => {
             let found = format!("{ahead_s:+.1} s from this host's: it is not believed");
-            Finding::new("camera clock", Verdict::Warn, found).mend(server)
+            Finding::new("camera clock", CheckResult::Warn, found).remedy(server)
         }
         (None, Some(delay_s)) => {
             let delay_s = delay_s + declared_s;
@@ -255,16 +258,16 @@ fn of_camera_clock(tried: &Tried, declared_s: f64) -> Finding {
                 found += ", clock.offset_s taken off";
             }
             let is_possible = (0.0..LATEST_S).contains(&delay_s);
-            let verdict = if is_possible { Verdict::Pass } else { Verdict::Warn };
+            let verdict = if is_possible { CheckResult::Pass } else { CheckResult::Warn };
             Finding::new("camera clock", verdict, found)
-                .mend(format!("{server}; or declare what it is ahead: clock.offset_s"))
+                .remedy(format!("{server}; or declare what it is ahead: clock.offset_s"))
         }
         (None, None) => Finding::new(
             "camera clock",
-            Verdict::Warn,
+            CheckResult::Warn,
             "the camera does not say what it shows: images are timed by their arrival",
         )
-        .mend(format!("{server}, and have it send RTCP sender reports")),
+        .remedy(format!("{server}, and have it send RTCP sender reports")),
     }
 }
 
@@ -272,34 +275,35 @@ fn of_decoder(tried: &Tried) -> Finding {
     let (width, height) = (tried.width & !1, tried.height & !1);
     let time_s = match decoding_time(width, height) {
         Ok(time) => time.as_secs_f64(),
-        Err(what) => return Finding::new("decoder", Verdict::Warn, what),
+        Err(what) => return Finding::new("decoder", CheckResult::Warn, what),
     };
     let share = time_s * tried.rate_hz;
     let verdict = if share < DECODING_SHARE {
-        Verdict::Pass
+        CheckResult::Pass
     } else if share < 1.0 {
-        Verdict::Warn
+        CheckResult::Warn
     } else {
-        Verdict::Fail
+        CheckResult::Fail
     };
     let found = format!(
         "{:.1} ms an image of {width}x{height}, {:.0} % of a core",
         time_s * 1e3,
         share * 100.0
     );
-    Finding::new("decoder", verdict, found).mend(parts::WITH_NASM)
+    Finding::new("decoder", verdict, found).remedy(parts::WITH_NASM)
 }
 
 /// Whether this host can listen at its own endpoint.
 fn of_own_endpoint(endpoint: &str) -> Finding {
     match TcpListener::bind(address(endpoint)) {
-        Ok(_) => Finding::new("endpoint", Verdict::Pass, format!("{endpoint} is free")),
+        Ok(_) => Finding::new("endpoint", CheckResult::Pass, format!("{endpoint} is free")),
         Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
             let found = format!("{endpoint} is in use: the agent runs already, or another program");
-            Finding::new("endpoint", Verdict::Warn, found).mend("stop it, or give another port")
+            Finding::new("endpoint", CheckResult::Warn, found)
+                .remedy("stop it, or give another port")
         }
-        Err(error) => Finding::new("endpoint", Verdict::Fail, format!("{endpoint}: {error}"))
-            .mend("it must be an address of this host, with a port above 1023"),
+        Err(error) => Finding::new("endpoint", CheckResult::Fail, format!("{endpoint}: {error}"))
+            .remedy("it must be an address of this host, with a port above 1023"),
     }
 }
 
@@ -317,10 +321,9 @@ fn of_network(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
         let concerns =
             |name: &CameraName| own_cameras.as_ref().is_none_or(|own| own.contains(name));
         let cameras = network.cameras.iter().filter(|(name, _)| concerns(name));
-        let camera = |(name, at): (&CameraName, &String)| {
-            others.of(name.as_str(), at, &Identity::Camera(name.clone()))
-        };
-        findings.extend(cameras.map(camera));
+        findings.extend(cameras.map(|(name, endpoint)| {
+            others.of(name.as_str(), endpoint, &Identity::Camera(name.clone()))
+        }));
         findings.extend(network.centres().map(|(area, endpoint)| {
             let who = area.as_ref().map_or("fusion centre".to_owned(), |a| format!("fusion {a}"));
             others.of(&who, endpoint, &Identity::Fusion(area))

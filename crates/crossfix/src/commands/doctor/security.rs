@@ -11,11 +11,13 @@ use crossfix_transport::{
     handshake,
 };
 
-use super::{Finding, Verdict};
+use super::{CheckResult, Finding};
 
+/// Seconds of a day.
 const DAY_S: u64 = 24 * 3600;
 /// Mode bit of a file that all users may read.
 const OTHERS_READ: u32 = 0o004;
+/// What to do about a certificate that has ended or is missing.
 const RENEW: &str = "crossfix enroll -c network.toml, and copy what it says to this host";
 
 /// Whether a component has a valid certificate to present.
@@ -27,29 +29,32 @@ pub fn of_own(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
         } else {
             "no certificates: components listen on this host alone"
         };
-        let verdict = if is_open { Verdict::Warn } else { Verdict::Pass };
+        let verdict = if is_open { CheckResult::Warn } else { CheckResult::Pass };
         return vec![
-            Finding::new("security", verdict, found).mend("crossfix enroll -c network.toml"),
+            Finding::new("security", verdict, found).remedy("crossfix enroll -c network.toml"),
         ];
     };
     let now = SystemTime::now();
     let credentials = match Credentials::load(security, identity, now) {
         Ok(credentials) => credentials,
         Err(error) => {
-            let mend = match &error {
+            let remedy = match &error {
                 CredentialsError::NotYet { .. } => "set this host's clock",
                 CredentialsError::Key { .. } => "copy both files of one issue",
                 CredentialsError::Read { .. } => "chown root:crossfix, chmod 640",
                 _ => RENEW,
             };
-            return vec![Finding::new("certificate", Verdict::Fail, words(&error)).mend(mend)];
+            return vec![
+                Finding::new("certificate", CheckResult::Fail, words(&error)).remedy(remedy),
+            ];
         }
     };
     let left = credentials.not_after().duration_since(now).unwrap_or_default();
     let days = left.as_secs() / DAY_S;
-    let verdict = if credentials.ending(now).is_some() { Verdict::Warn } else { Verdict::Pass };
+    let verdict =
+        if credentials.ending(now).is_some() { CheckResult::Warn } else { CheckResult::Pass };
     let found = format!("{} for {days} more days", security.common_name(identity));
-    let mut findings = vec![Finding::new("certificate", verdict, found).mend(RENEW)];
+    let mut findings = vec![Finding::new("certificate", verdict, found).remedy(RENEW)];
     findings.extend(of_key(&security.key_file(identity)));
     findings
 }
@@ -59,7 +64,7 @@ fn of_key(path: &Path) -> Option<Finding> {
     let mode = std::fs::metadata(path).ok()?.permissions().mode();
     (mode & OTHERS_READ != 0).then(|| {
         let found = format!("everybody on this host can read {}", path.display());
-        Finding::new("key", Verdict::Warn, found).mend("chmod 640, or 600")
+        Finding::new("key", CheckResult::Warn, found).remedy("chmod 640, or 600")
     })
 }
 
@@ -83,7 +88,7 @@ impl<'a> OtherComponents<'a> {
         match &self.shown {
             Some(credentials) => self.by_handshake(credentials, who, endpoint, wanted),
             None => match connect(address(endpoint)) {
-                Ok(_) => Finding::new(who, Verdict::Pass, format!("{endpoint} answers")),
+                Ok(_) => Finding::new(who, CheckResult::Pass, format!("{endpoint} answers")),
                 Err(error) => unreachable(who, endpoint, &error),
             },
         }
@@ -99,19 +104,19 @@ impl<'a> OtherComponents<'a> {
         let believed = self.network.security.as_ref().map(|it| it.common_name(wanted));
         match handshake(credentials, address(endpoint)) {
             Ok(name) if believed.as_ref() == Some(&name) => {
-                Finding::new(who, Verdict::Pass, format!("{endpoint} answers as {name}"))
+                Finding::new(who, CheckResult::Pass, format!("{endpoint} answers as {name}"))
             }
             Ok(name) => Finding::new(
                 who,
-                Verdict::Fail,
+                CheckResult::Fail,
                 format!("{endpoint} shows `{name}`, and `{wanted}` is wanted there"),
             )
-            .mend(
+            .remedy(
                 "another's endpoint, a revoked certificate, or an older network file here or there",
             ),
             Err(HandshakeError::Connect(error)) => unreachable(who, endpoint, &error),
             Err(error) => {
-                let mend = match &error {
+                let remedy = match &error {
                     HandshakeError::OursRefused(_) => RENEW,
                     HandshakeError::NoTls => "give it the network file with [security]",
                     _ => {
@@ -119,7 +124,7 @@ impl<'a> OtherComponents<'a> {
                     }
                 };
                 let found = format!("{endpoint}: {}", words(&error));
-                Finding::new(who, Verdict::Fail, found).mend(mend)
+                Finding::new(who, CheckResult::Fail, found).remedy(remedy)
             }
         }
     }
@@ -137,10 +142,10 @@ fn words(error: &dyn Error) -> String {
 }
 
 fn unreachable(who: &str, endpoint: &str, error: &io::Error) -> Finding {
-    let mend = match error.kind() {
+    let remedy = match error.kind() {
         io::ErrorKind::ConnectionRefused => "the host is there: start it on it",
         io::ErrorKind::TimedOut => "is that its address, and is the port open?",
         _ => "is that its address?",
     };
-    Finding::new(who, Verdict::Fail, format!("{endpoint}: {error}")).mend(mend)
+    Finding::new(who, CheckResult::Fail, format!("{endpoint}: {error}")).remedy(remedy)
 }

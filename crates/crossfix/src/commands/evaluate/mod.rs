@@ -4,31 +4,34 @@ use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
 use crossfix_evaluation::{
-    Delays, Estimate, Evaluator, Latency, LatencyRecorder, Report, Sightings, TrackHistory,
-    TrueTarget,
+    Delays, Estimate, Evaluator, Latency, LatencyRecorder, Report, Sightings, TargetReport,
+    TrackHistory, TrueTarget,
 };
 use crossfix_message::{
     BearingFrame, CameraCalibration, Channel, Datum, Timestamp, TrackFrame, TrueState, TruthFrame,
 };
+use crossfix_recording::Entry;
 use serde::Serialize;
 
 use super::numbers;
+use crate::commands::examples;
 use crate::output;
 use crate::recorded::{self, Lacks};
 
-/// Hold the tracks of a recording against the truth in it, or two runs against each other.
+/// Compare the tracks of a recording with the truth in it, or two runs with each other.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix evaluate tracks.mcap --json\n  \
-    crossfix evaluate tracks.mcap --min-cameras 3\n  \
-    crossfix evaluate before.mcap after.mcap --save both.rrd")]
+#[command(after_help = examples(&[
+    "crossfix evaluate tracks.mcap --json",
+    "crossfix evaluate tracks.mcap --min-cameras 3",
+    "crossfix evaluate before.mcap after.mcap --save both.rrd",
+]))]
 pub struct Args {
     /// The recording (MCAP) with tracks and truth.
     recording: PathBuf,
-    /// A second run over the same data: both side by side, against the truth of the first.
+    /// A second run over the same data: both are compared with the truth of the first.
     #[arg(value_name = "RECORDING")]
     beside: Option<PathBuf>,
-    /// Draw both runs and the truth beside each other, a file for Rerun.
+    /// Draw both runs and the truth into one picture for Rerun (.rrd).
     #[cfg(feature = "viewer")]
     #[arg(long, value_name = "RRD", requires = "beside")]
     save: Option<PathBuf>,
@@ -39,19 +42,19 @@ pub struct Args {
     json: bool,
 }
 
-/// What is held against what.
+/// What is compared, and how.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Question {
     /// A second recording (MCAP) with the truth, if the first has none.
     #[arg(long, value_name = "FILE")]
     pub truth: Option<PathBuf>,
-    /// Farther than this from a target a track is not that target's, metres.
+    /// A track farther from a target than this is not counted as that target's, metres.
     #[arg(long, default_value_t = 5.0, value_name = "METRES", value_parser = numbers::distance)]
     pub cutoff_m: f64,
-    /// Leave out what lies less than this after the first truth, seconds.
+    /// Leave out this much time after the first truth, seconds.
     #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::seconds)]
     pub skip_s: f64,
-    /// Standard deviation of the truth's places, metres per axis: what it may be off by itself.
+    /// Standard deviation of the truth's own positions, metres per axis.
     #[arg(
         long,
         default_value_t = 0.0,
@@ -59,11 +62,11 @@ pub struct Question {
         value_parser = numbers::metres_or_none
     )]
     pub truth_sd: f64,
-    /// Only the instants at which so many cameras saw something: in the frame just before and in
-    /// that just after.
+    /// Count only the instants at which at least this many cameras saw something, both in the frame
+    /// just before and in the frame just after.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub min_cameras: usize,
-    /// The smoothed tracks (of `fuse --lag`) in the place of those that went out at once.
+    /// Use the smoothed tracks (of `fuse --lag`) instead of the live ones.
     #[arg(long)]
     pub smoothed: bool,
 }
@@ -124,34 +127,39 @@ impl EvaluatedRun {
     fn read(&mut self, path: &Path, smoothed: bool) -> anyhow::Result<Lacks> {
         let mut lacks = Lacks::default();
         recorded::for_each(path, &mut lacks, |lacks, entry| {
-            match entry.key.channel {
-                Channel::Calibration(_) => {
-                    let message = lacks.read::<CameraCalibration>(&entry.data);
-                    let datum = message.and_then(|message| message.datum?.parse());
-                    self.datum = self.datum.take().or(datum);
-                }
-                Channel::Truth => self.truth.extend(lacks.read::<TruthFrame>(&entry.data)),
-                Channel::Tracks | Channel::Smoothed
-                    if smoothed == (entry.key.channel == Channel::Smoothed) =>
-                {
-                    if let Some(frame) = lacks.read::<TrackFrame>(&entry.data) {
-                        self.track_frames += 1;
-                        self.latency.tracks(&frame.camera, frame.camera_sequence, entry.arrival);
-                        self.tracks.add(&frame);
-                    }
-                }
-                Channel::Bearings(_) => {
-                    if let Some(frame) = lacks.read::<BearingFrame>(&entry.data) {
-                        self.latency.bearing(&frame.camera, frame.sequence, entry.arrival);
-                        self.sightings.add(&frame);
-                    }
-                }
-                _ => {}
-            }
+            self.add(&entry, smoothed, lacks);
             Ok(())
         })?;
         lacks.say(path);
         Ok(lacks)
+    }
+
+    /// Adds a message of the recording; of the tracks only the smoothed or only the live ones.
+    fn add(&mut self, entry: &Entry, smoothed: bool, lacks: &mut Lacks) {
+        match entry.key.channel {
+            Channel::Calibration(_) => {
+                let message = lacks.read::<CameraCalibration>(&entry.data);
+                let datum = message.and_then(|message| message.datum?.parse());
+                self.datum = self.datum.take().or(datum);
+            }
+            Channel::Truth => self.truth.extend(lacks.read::<TruthFrame>(&entry.data)),
+            Channel::Tracks | Channel::Smoothed
+                if smoothed == (entry.key.channel == Channel::Smoothed) =>
+            {
+                if let Some(frame) = lacks.read::<TrackFrame>(&entry.data) {
+                    self.track_frames += 1;
+                    self.latency.tracks(&frame.camera, frame.camera_sequence, entry.arrival);
+                    self.tracks.add(&frame);
+                }
+            }
+            Channel::Bearings(_) => {
+                if let Some(frame) = lacks.read::<BearingFrame>(&entry.data) {
+                    self.latency.bearing(&frame.camera, frame.sequence, entry.arrival);
+                    self.sightings.add(&frame);
+                }
+            }
+            _ => {}
+        }
     }
 }
 
@@ -200,7 +208,8 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
     let report = evaluator.report();
     ensure!(
         report.instants > 0,
-        "of the {} instants of the truth none is at least {} s after the first and seen by at least {} cameras",
+        "of the {} instants of the truth none is at least {} s after the first \
+         and seen by at least {} cameras",
         times.len(),
         question.skip_s,
         question.min_cameras
@@ -235,40 +244,37 @@ fn run_beside(args: &Args, beside: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The results as a text for people.
+/// Titles of the table's columns. Each NEES has its expected value in brackets.
+const TITLES: [&str; 9] = [
+    "target",
+    "detected",
+    "tracked",
+    "RMSE [m]",
+    "RMSE [m/s]",
+    "NEES (6)",
+    "median (5.3)",
+    "position (3)",
+    "velocity (3)",
+];
+
+/// What the titles leave out, for below the table.
+const LEGEND: &str = "\
+    RMSE of the position and of the velocity. NEES, with its expected value in brackets: mean and\n\
+    median for position and velocity together, then the mean for each alone.";
+
+/// The results as a text for people, at most 100 columns wide.
 pub fn render(evaluation: &Evaluation) -> String {
     let Evaluation { report, latency, .. } = evaluation;
-    let head = [
-        "target",
-        "detected",
-        "tracked",
-        "position RMSE [m]",
-        "velocity RMSE [m/s]",
-        "NEES (6)",
-        "median (5.3)",
-        "position NEES (3)",
-        "velocity NEES (3)",
-    ];
-    let mut rows = vec![head.map(str::to_owned).to_vec()];
-    rows.extend(report.targets.iter().map(|target| {
-        vec![
-            target.target.to_string(),
-            if target.detected { "yes" } else { "no" }.to_owned(),
-            format!("{:.1} %", 100.0 * target.share_tracked),
-            output::number(target.position_rmse_m, 3),
-            output::number(target.velocity_rmse_mps, 3),
-            output::number(target.nees.mean, 2),
-            output::number(target.nees.median, 2),
-            output::number(target.position_nees.mean, 2),
-            output::number(target.velocity_nees.mean, 2),
-        ]
-    }));
+    let mut rows = vec![TITLES.map(str::to_owned).to_vec()];
+    rows.extend(report.targets.iter().map(row));
     let latency = latency.map_or_else(String::new, |latency| {
         format!("\nbearing to track: p50 {:.1} ms, p99 {:.1} ms", latency.p50_ms, latency.p99_ms)
     });
     format!(
-        "{}\n\n{} instants, {} answers: {} off by more than 1 m, {} by more than 4 SD, {} false (farther than {} m \
-         from every target)\n{} false tracks, {} changes of identity, OSPA {:.3} m, GOSPA {:.3} m\n{}{latency}",
+        "{}\n{LEGEND}\n\n\
+         {} instants, {} answers: {} off by more than 1 m, {} by more than 4 SD\n\
+         {} false answers (farther than {} m from every target)\n\
+         {} false tracks, {} changes of identity, OSPA {:.3} m, GOSPA {:.3} m\n{}{latency}",
         output::table(&rows),
         report.instants,
         report.answers,
@@ -284,6 +290,21 @@ pub fn render(evaluation: &Evaluation) -> String {
     )
 }
 
+/// The table's row of a target.
+fn row(target: &TargetReport) -> Vec<String> {
+    vec![
+        target.target.to_string(),
+        if target.detected { "yes" } else { "no" }.to_owned(),
+        format!("{:.1} %", 100.0 * target.share_tracked),
+        output::number(target.position_rmse_m, 3),
+        output::number(target.velocity_rmse_mps, 3),
+        output::number(target.nees.mean, 2),
+        output::number(target.nees.median, 2),
+        output::number(target.position_nees.mean, 2),
+        output::number(target.velocity_nees.mean, 2),
+    ]
+}
+
 fn percent(share: Option<f64>) -> String {
     share.map_or_else(|| "-".to_owned(), |share| format!("{:.2} %", 100.0 * share))
 }
@@ -294,15 +315,12 @@ fn waits(delays: &Delays) -> String {
         || "a target was never answered for".to_owned(),
         |first| format!("first answer after {first:.1} s"),
     );
-    let seconds = |value: Option<f64>| {
-        value.map_or_else(|| "never".to_owned(), |value| format!("{value:.1} s"))
-    };
     let next = match delays.returns {
         0 => String::new(),
         returns => format!(
             "; of {returns} returns half answered for within {}, 90 % within {}",
-            seconds(delays.next_median_s),
-            seconds(delays.next_p90_s)
+            seconds_or_never(delays.next_median_s),
+            seconds_or_never(delays.next_p90_s)
         ),
     };
     let unanswered = match delays.unanswered {
@@ -311,4 +329,8 @@ fn waits(delays: &Delays) -> String {
         many => format!("; {many} stretches of more than a second without any answer"),
     };
     format!("{first}{next}{unanswered}")
+}
+
+fn seconds_or_never(value: Option<f64>) -> String {
+    value.map_or_else(|| "never".to_owned(), |value| format!("{value:.1} s"))
 }

@@ -9,27 +9,29 @@ use crossfix_message::{Channel, Timestamp, TrackFrame, TrackState};
 use serde::Deserialize;
 
 use self::others::OtherFormats;
+use crate::commands::examples;
 use crate::output::{self, Draft};
 use crate::recorded::{self, Lacks};
 
-/// Write the confirmed tracks of a recording as a table, or in the formats of others.
+/// Write the confirmed tracks of a recording as a table, or in formats of other programs.
 ///
-/// Columns t,track_id,x,y,z,vx,vy,vz,state,cameras,sd_m,time_sd_s: seconds since the Unix epoch,
-/// metres, metres per second, what the track is (confirmed or coasting; with --all also tentative
-/// and one-camera), how many cameras have given it a bearing within the second before, the root of
-/// the sum of the position's variances, metres, and the standard deviation of t, which is not in
-/// these: what all clocks are off by together, seconds. With --times, the state of each track at
-/// those times from its last frame at or before them, extrapolated with its velocity.
+/// The table's columns: t, seconds since the Unix epoch; track_id; x, y, z, metres; vx, vy, vz,
+/// metres per second; state (confirmed or coasting; with --all also tentative and one-camera);
+/// cameras, how many cameras have given the track a bearing within the last second; sd_m, the root
+/// of the sum of the position's variances, metres; time_sd_s, the standard deviation of t, seconds:
+/// the error that all clocks have in common, which sd_m does not include. With --times, the state
+/// of each track at those times: that of its last frame before, extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
 #[command(
     override_usage = "crossfix export [OPTIONS] <RECORDING> \\\n           \
         <--csv|--geojson|--kml|--cot|--sapient|--asterix|--foxglove> <FILE> ...",
     group = clap::ArgGroup::new("written").required(true).multiple(true)
         .args(["csv", "geojson", "kml", "cot", "sapient", "asterix", "foxglove"]),
-    after_help = "Examples:\n  \
-        crossfix export tracks.mcap --csv tracks.csv --times times.csv\n  \
-        crossfix export tracks.mcap --kml flights.kml --anchor 48.3538,11.7861,490\n  \
-        crossfix export site.mcap --foxglove shown.mcap"
+    after_help = examples(&[
+        "crossfix export tracks.mcap --csv tracks.csv --times times.csv",
+        "crossfix export tracks.mcap --kml flights.kml --anchor 48.3538,11.7861,490",
+        "crossfix export site.mcap --foxglove shown.mcap",
+    ])
 )]
 pub struct Args {
     /// The recording (MCAP) with tracks.
@@ -37,14 +39,14 @@ pub struct Args {
     /// The table to write (CSV).
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
-    /// A table (CSV) with a column `t`: the times to answer, seconds since the Unix epoch.
+    /// A table (CSV) with a column `t`: the times to write, seconds since the Unix epoch.
     #[arg(long, value_name = "FILE")]
     times: Option<PathBuf>,
-    /// Also the tracks that are not sure yet, and those that one camera alone follows: their range
-    /// is a guess.
+    /// Also write the tracks that are not confirmed, and those that only one camera sees: their
+    /// range is a guess.
     #[arg(long)]
     all: bool,
-    /// The smoothed tracks (of `fuse --lag`) in the place of those that went out at once.
+    /// Use the smoothed tracks (of `fuse --lag`) instead of the live ones.
     #[arg(long)]
     smoothed: bool,
     #[command(flatten)]
@@ -81,7 +83,7 @@ fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
         std::iter::once(&args.recording).chain(&args.times).map(PathBuf::as_path).collect();
     let draft = Draft::new(csv, &inputs)?;
     let cannot_write = || format!("cannot write {}", csv.display());
-    let mut table = Table::create(draft.path()).with_context(cannot_write)?;
+    let mut table = TrackTable::create(draft.path()).with_context(cannot_write)?;
     table.writer.write_record(COLUMNS)?;
     let at = |time| if args.all { history.all_at(time) } else { history.at(time) };
     match &args.times {
@@ -130,16 +132,17 @@ fn read_history(args: &Args) -> anyhow::Result<TrackHistory> {
     Ok(history)
 }
 
+/// Titles of the table's columns, in order.
 const COLUMNS: [&str; 12] =
     ["t", "track_id", "x", "y", "z", "vx", "vy", "vz", "state", "cameras", "sd_m", "time_sd_s"];
 
 /// A table of tracks that is being written.
-struct Table {
+struct TrackTable {
     writer: ::csv::Writer<File>,
     rows: u64,
 }
 
-impl Table {
+impl TrackTable {
     fn create(path: &Path) -> ::csv::Result<Self> {
         Ok(Self { writer: ::csv::Writer::from_path(path)?, rows: 0 })
     }

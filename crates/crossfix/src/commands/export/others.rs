@@ -7,28 +7,31 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use crossfix_geometry::Geodetic;
 use crossfix_message::{
-    CameraCalibration, Channel, SiteName, Timestamp, TrackEvent, TrackFrame, glance,
+    AreaName, CameraCalibration, Channel, SiteName, Timestamp, TrackEvent, TrackFrame, glance,
 };
-use crossfix_outlet::foxglove::{FoxgloveView, Pictures};
+use crossfix_outlet::foxglove::{FoxgloveView, PictureExport};
 use crossfix_outlet::{GeoJsonFlights, Kml, Outlet, Sapient, Situation};
 use crossfix_recording::{Entry, RecordingWriter, Source};
 
+use crate::commands::anchor::AnchorArg;
 use crate::commands::numbers;
 use crate::commands::outlet::FormatArgs;
 use crate::commands::record::foxglove;
 use crate::output::{self, Draft};
 use crate::recorded::{self, Lacks};
 
-/// Files in the formats of others.
+/// Files in formats of other programs.
 #[derive(Clone, Debug, clap::Args)]
 pub struct OtherFormats {
-    /// Write each track's flight as GeoJSON (WGS84); needs --anchor, as do all but --foxglove.
+    /// Write each track's flight as GeoJSON (WGS84). This and the other formats except --foxglove
+    /// need --anchor.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     geojson: Option<PathBuf>,
     /// Write each track's flight as KML, for Google Earth.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     kml: Option<PathBuf>,
-    /// With --kml: how high the geoid (mean sea level) is above the ellipsoid there, metres.
+    /// With --kml: height of the geoid (mean sea level) above the WGS84 ellipsoid at the site,
+    /// metres.
     #[arg(
         long,
         value_name = "METRES",
@@ -37,31 +40,24 @@ pub struct OtherFormats {
         allow_hyphen_values = true
     )]
     geoid: f64,
-    /// Write events of Cursor on Target, one after the other.
+    /// Write Cursor-on-Target events, one after the other.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     cot: Option<PathBuf>,
-    /// Write messages of SAPIENT, each after its length.
+    /// Write SAPIENT messages, each preceded by its length.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     sapient: Option<PathBuf>,
-    /// Write blocks of ASTERIX category 062.
+    /// Write ASTERIX blocks of category 062.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     asterix: Option<PathBuf>,
-    /// Write the recording again with Foxglove's schemas beside ours (MCAP): it opens in Foxglove
-    /// and Rerun without Crossfix.
+    /// Write the recording again (MCAP) with its contents also in Foxglove's schemas: it opens in
+    /// Foxglove and Rerun without Crossfix.
     #[arg(long, value_name = "FILE")]
     foxglove: Option<PathBuf>,
-    /// How often the targets' places are said in the formats of others, a second.
+    /// How often each target's position is written in these formats, times per second of data.
     #[arg(long, value_name = "HERTZ", default_value_t = 10.0, value_parser = numbers::outlet_rate)]
     rate_hz: f64,
-    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
-    /// ellipsoid.
-    #[arg(
-        long,
-        value_name = "LAT,LON,HEIGHT",
-        value_parser = numbers::place,
-        allow_hyphen_values = true
-    )]
-    anchor: Option<Geodetic>,
+    #[command(flatten)]
+    origin: AnchorArg,
     #[command(flatten)]
     formats: FormatArgs,
 }
@@ -70,18 +66,20 @@ impl OtherFormats {
     /// Writes the formats that are asked for.
     pub fn write(&self, recording: &Path, channel: &Channel) -> anyhow::Result<()> {
         let site = site_of(recording)?;
-        if let Some(anchor) = self.anchor {
-            let told = Told { recording, channel, site: &site, anchor, rate_hz: self.rate_hz };
+        if let Some(anchor) = self.origin.anchor {
+            let tracks =
+                RecordedTracks { recording, channel, site: &site, anchor, rate_hz: self.rate_hz };
             let formats = &self.formats;
-            told.write(self.geojson.as_deref(), || Ok(Box::<GeoJsonFlights>::default()))?;
-            told.write(self.kml.as_deref(), || Ok(Box::new(Kml::above_geoid(self.geoid))))?;
-            told.write(self.cot.as_deref(), || Ok(Box::new(formats.cot_type.clone())))?;
-            told.write(self.asterix.as_deref(), || Ok(Box::new(formats.asterix_source.clone())))?;
+            tracks.write(self.geojson.as_deref(), || Ok(Box::<GeoJsonFlights>::default()))?;
+            tracks.write(self.kml.as_deref(), || Ok(Box::new(Kml::above_geoid(self.geoid))))?;
+            tracks.write(self.cot.as_deref(), || Ok(Box::new(formats.cot_type.clone())))?;
+            tracks
+                .write(self.asterix.as_deref(), || Ok(Box::new(formats.asterix_source.clone())))?;
             let sapient = || Ok(Box::new(Sapient::of_site(site.clone())) as Box<dyn Outlet>);
-            told.write(self.sapient.as_deref(), sapient)?;
+            tracks.write(self.sapient.as_deref(), sapient)?;
         }
         match &self.foxglove {
-            Some(path) => write_foxglove(recording, path, &site, self.anchor),
+            Some(path) => write_foxglove(recording, path, &site, self.origin.anchor),
             None => Ok(()),
         }
     }
@@ -103,8 +101,8 @@ fn site_of(recording: &Path) -> anyhow::Result<SiteName> {
 /// twice as much the beginning of a run that is three seconds earlier is left out.
 const OUT_OF_ORDER_S: f64 = 2.0;
 
-/// A recording's tracks, to be passed to an outlet.
-struct Told<'a> {
+/// A recording's tracks, to be written by outlets.
+struct RecordedTracks<'a> {
     recording: &'a Path,
     channel: &'a Channel,
     site: &'a SiteName,
@@ -112,7 +110,8 @@ struct Told<'a> {
     rate_hz: f64,
 }
 
-impl Told<'_> {
+impl RecordedTracks<'_> {
+    /// Writes the file of one format, if it is asked for.
     fn write(
         &self,
         path: Option<&Path>,
@@ -122,9 +121,19 @@ impl Told<'_> {
         let cannot_write = || format!("cannot write {}", path.display());
         let draft = Draft::new(path, &[self.recording])?;
         let file = BufWriter::new(File::create(draft.path()).with_context(cannot_write)?);
-        let mut written =
-            OutletFile { path, file, outlet: outlet()?, is_greeted: false, messages: 0 };
-        self.tell(&mut written)?;
+        let mut written = OutletFile {
+            path,
+            file,
+            outlet: outlet()?,
+            situation: Situation::new(self.site.clone(), self.anchor),
+            period_s: self.rate_hz.recip(),
+            next: None,
+            last: Timestamp::EPOCH,
+            frames: 0,
+            is_greeted: false,
+            messages: 0,
+        };
+        self.send_to(&mut written)?;
         let messages = written.finish()?;
         draft.keep()?;
         let count = if messages == 1 { String::new() } else { format!(": {messages} messages") };
@@ -132,68 +141,88 @@ impl Told<'_> {
         Ok(())
     }
 
-    /// Passes the tracks to an outlet at even intervals of data time.
-    fn tell(&self, written: &mut OutletFile<'_>) -> anyhow::Result<()> {
-        let mut situation = Situation::new(self.site.clone(), self.anchor);
-        let period_s = self.rate_hz.recip();
-        let mut next: Option<Timestamp> = None;
-        let mut last = Timestamp::EPOCH;
+    /// Passes the whole recording to an outlet.
+    fn send_to(&self, written: &mut OutletFile<'_>) -> anyhow::Result<()> {
         let mut lacks = Lacks::default();
-        let mut frames = 0_u64;
         recorded::for_each(self.recording, &mut lacks, |lacks, entry| {
-            match &entry.key.channel {
-                Channel::Calibration(_) => {
-                    if let Some(message) = lacks.read::<CameraCalibration>(&entry.data) {
-                        situation.hear_calibration(&message);
-                    }
-                }
-                Channel::Events => {
-                    if let Some(event) = lacks.read::<TrackEvent>(&entry.data) {
-                        written.greet(Timestamp::from_nanos(event.time_ns))?;
-                        let messages = written.outlet.event(&event);
-                        written.put(messages)?;
-                    }
-                }
-                channel if channel == self.channel => {
-                    let Some(frame) = lacks.read::<TrackFrame>(&entry.data) else { return Ok(()) };
-                    frames += 1;
-                    situation.hear(entry.key.area.as_ref(), &frame);
-                    last = Timestamp::from_nanos(frame.time_ns);
-                    // A recording may have gaps, and runs with earlier times: missed intervals are
-                    // not made up for.
-                    let is_due = next.is_none_or(|next| {
-                        last >= next || next.seconds_since(last) > period_s + OUT_OF_ORDER_S
-                    });
-                    if is_due {
-                        next = Some(last.plus_seconds(period_s));
-                        written.greet(last)?;
-                        if let Some(snapshot) = situation.snapshot(0.0) {
-                            let messages = written.outlet.tracks(&snapshot);
-                            written.put(messages)?;
-                        }
-                    }
-                }
-                _ => {}
-            }
-            Ok(())
+            written.take(&entry, self.channel, lacks)
         })?;
         lacks.say(self.recording);
-        lacks.ensure_found(frames > 0, "tracks", self.recording)?;
-        let messages = written.outlet.farewell(last);
+        lacks.ensure_found(written.frames > 0, "tracks", self.recording)?;
+        let messages = written.outlet.farewell(written.last);
         written.put(messages)
     }
 }
 
-/// A file that an outlet's messages are written to.
+/// A file that an outlet's messages are written to, at even intervals of data time.
 struct OutletFile<'a> {
     path: &'a Path,
     file: BufWriter<File>,
     outlet: Box<dyn Outlet>,
+    situation: Situation,
+    /// Data time between two messages on the targets, s.
+    period_s: f64,
+    /// When the targets are due next; `None` before the first tracks.
+    next: Option<Timestamp>,
+    /// Time of the newest tracks.
+    last: Timestamp,
+    /// Number of messages with tracks so far.
+    frames: u64,
     is_greeted: bool,
     messages: u64,
 }
 
 impl OutletFile<'_> {
+    /// Takes a message of the recording; its tracks are those on `channel`.
+    fn take(&mut self, entry: &Entry, channel: &Channel, lacks: &mut Lacks) -> anyhow::Result<()> {
+        match &entry.key.channel {
+            Channel::Calibration(_) => {
+                if let Some(message) = lacks.read::<CameraCalibration>(&entry.data) {
+                    self.situation.add_calibration(&message);
+                }
+            }
+            Channel::Events => {
+                if let Some(event) = lacks.read::<TrackEvent>(&entry.data) {
+                    self.greet(Timestamp::from_nanos(event.time_ns))?;
+                    let messages = self.outlet.event(&event);
+                    self.put(messages)?;
+                }
+            }
+            of_tracks if of_tracks == channel => {
+                if let Some(frame) = lacks.read::<TrackFrame>(&entry.data) {
+                    self.take_tracks(entry.key.area.as_ref(), &frame)?;
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Takes an area's tracks, and writes where the targets are if that is due.
+    fn take_tracks(&mut self, area: Option<&AreaName>, frame: &TrackFrame) -> anyhow::Result<()> {
+        self.frames += 1;
+        self.situation.add_tracks(area, frame);
+        let now = Timestamp::from_nanos(frame.time_ns);
+        self.last = now;
+        // A recording may have gaps, and runs with earlier times: missed intervals are not made up
+        // for.
+        let is_due = self.next.is_none_or(|next| {
+            now >= next || next.seconds_since(now) > self.period_s + OUT_OF_ORDER_S
+        });
+        if !is_due {
+            return Ok(());
+        }
+        self.next = Some(now.plus_seconds(self.period_s));
+        self.greet(now)?;
+        match self.situation.snapshot(0.0) {
+            Some(snapshot) => {
+                let messages = self.outlet.tracks(&snapshot);
+                self.put(messages)
+            }
+            None => Ok(()),
+        }
+    }
+
     /// Writes the outlet's greeting, the first time.
     fn greet(&mut self, now: Timestamp) -> anyhow::Result<()> {
         if std::mem::replace(&mut self.is_greeted, true) {
@@ -230,7 +259,7 @@ fn write_foxglove(
     let draft = Draft::new(path, &[recording])?;
     let mut writer = RecordingWriter::create(draft.path())?;
     writer.sign(&Source::of("export --foxglove"))?;
-    let mut view = FoxgloveView::new(site, anchor, Pictures::Said);
+    let mut view = FoxgloveView::new(site, anchor, PictureExport::Said);
     let mut lacks = Lacks::default();
     let (mut read, mut newer) = (0, 0);
     recorded::for_each(recording, &mut lacks, |_, entry: Entry| {

@@ -9,28 +9,28 @@ use crossfix_message::{
 use crossfix_transport::NetworkConfig;
 
 /// The neighbouring areas, and what is exchanged with them.
-pub struct Border {
+pub struct AreaBorder {
     neighbours: Neighbours,
     /// The neighbouring areas with their indices among all areas.
     beside: BTreeMap<AreaName, usize>,
     /// Cameras that another area's centre cues: cued by two centres, a camera would turn to and
     /// fro.
-    told_by_others: Vec<CameraName>,
+    cued_by_others: Vec<CameraName>,
 }
 
-impl Border {
+impl AreaBorder {
     /// The border of one area of the network.
     pub fn new(network: &NetworkConfig, area: &AreaName, config: &FusionConfig) -> Self {
         let place = |area: &AreaName| network.areas.keys().take_while(|one| *one < area).count();
         let beside = network.neighbours(area).into_iter().map(|one| (one.clone(), place(&one)));
-        let told_by_others = |camera: &&CameraName| network.heard_by(camera).first() != Some(area);
+        let cued_by_others = |camera: &&CameraName| network.areas_of(camera).first() != Some(area);
         Self {
             neighbours: Neighbours::new(
                 Share { index: place(area), of: network.areas.len() },
                 config,
             ),
             beside: beside.collect(),
-            told_by_others: network.cameras.keys().filter(told_by_others).cloned().collect(),
+            cued_by_others: network.cameras.keys().filter(cued_by_others).cloned().collect(),
         }
     }
 
@@ -42,20 +42,20 @@ impl Border {
     }
 
     /// Takes in the tracks of another area.
-    pub fn hear(&mut self, area: &AreaName, data: &[u8]) -> Result<(), DecodeError> {
+    pub fn add_tracks(&mut self, area: &AreaName, data: &[u8]) -> Result<(), DecodeError> {
         if let Some(place) = self.beside.get(area) {
-            self.neighbours.hear(*place, &decode::<TrackFrame>(data)?);
+            self.neighbours.receive(*place, &decode::<TrackFrame>(data)?);
         }
         Ok(())
     }
 
     /// The fusion's outputs that are to be published, with the neighbours' tracks taken into
     /// account.
-    pub fn pass(&mut self, outputs: Vec<Output>) -> Vec<Output> {
-        let mut outputs = self.neighbours.pass(outputs);
-        let is_told_here = |camera: &str| self.told_by_others.iter().all(|c| c.as_str() != camera);
+    pub fn published(&mut self, outputs: Vec<Output>) -> Vec<Output> {
+        let mut outputs = self.neighbours.forward(outputs);
+        let is_cued_here = |camera: &str| self.cued_by_others.iter().all(|c| c.as_str() != camera);
         outputs.retain(|output| match output {
-            Output::Cues(cues) => is_told_here(&cues.camera),
+            Output::Cues(cues) => is_cued_here(&cues.camera),
             _ => true,
         });
         outputs

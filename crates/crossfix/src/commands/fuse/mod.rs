@@ -10,8 +10,9 @@ use crossfix_transport::{
     Delivery, Identity, Link, LinkPublisher, Received, Reception, Role, Subscription,
 };
 
-use self::border::Border;
+use self::border::AreaBorder;
 use crate::centre::Centre;
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::config::{self, FusionFile};
 use crate::health::{self, HealthArgs, HealthReporter};
@@ -27,7 +28,9 @@ const POLL: Duration = Duration::from_millis(20);
 
 /// Run the fusion centre: bearings in, tracks out.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix fuse -c configs/site/fusion.toml")]
+#[command(after_help = examples(&[
+    "crossfix fuse -c configs/site/fusion.toml",
+]))]
 pub struct Args {
     /// The fusion centre's configuration (TOML).
     #[arg(short, long, value_name = "FILE")]
@@ -50,7 +53,7 @@ pub struct Args {
 struct Station {
     centre: Centre,
     /// The exchange with neighbouring areas, if there are any.
-    border: Option<Border>,
+    border: Option<AreaBorder>,
     link: Link,
     tracks: LinkPublisher,
     smoothed: LinkPublisher,
@@ -79,7 +82,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     let lookout = Lookout::for_cameras(&link, &network, &everybody)?;
     let config = file.fusion().smoothed(args.lag);
-    let border = file.area.as_ref().map(|area| Border::new(&network, area, &config));
+    let border = file.area.as_ref().map(|area| AreaBorder::new(&network, area, &config));
     let mut station = Station {
         centre: Centre::new(config, Some(cameras))?,
         border,
@@ -146,7 +149,7 @@ impl Station {
                         "the fusion centre reads its configuration at its start alone: restart it"
                     );
                 }
-                self.lookout.look(healthy_at);
+                self.lookout.check(healthy_at);
                 self.centre.remind(healthy_at);
                 self.say_health(subscription, false)?;
             }
@@ -200,7 +203,7 @@ impl Station {
             |o| format!(" from run {}", o.run),
         );
         if let (Some(border), Some(area)) = (&mut self.border, &key.area) {
-            if let Err(error) = border.hear(area, data) {
+            if let Err(error) = border.add_tracks(area, data) {
                 let what = format!("what area `{area}` says of its tracks");
                 self.centre.refuse(&what, &sender, &error);
             }
@@ -212,7 +215,7 @@ impl Station {
 
     fn publish(&mut self, outputs: Vec<Output>) -> anyhow::Result<()> {
         let outputs = match &mut self.border {
-            Some(border) => border.pass(outputs),
+            Some(border) => border.published(outputs),
             None => outputs,
         };
         for output in outputs {

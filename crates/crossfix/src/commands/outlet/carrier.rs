@@ -20,7 +20,7 @@ use crate::pace::wall_seconds;
 /// meanwhile, and are not lost. With half of it a receiver that takes longer to accept is never
 /// reached.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Pause after a connection has failed. With twice as much a receiver that is back hears nothing
+/// Pause after a connection has failed. With twice as much a receiver that is back gets nothing
 /// for up to two seconds.
 const RETRY: Duration = Duration::from_secs(1);
 /// How often it is logged that there is no receiver. With half of it an hour without one costs 120
@@ -29,10 +29,12 @@ const REMINDER: Duration = Duration::from_secs(60);
 /// How long a check for data from the receiver takes. Each message of the site waits for it: with
 /// twice as much 500 of them per second would be the most.
 const GLANCE: Duration = Duration::from_millis(1);
-/// Size of the pieces in which the receiver's data are read, bytes, and most pieces read at once: a
-/// TAK server relays everybody's messages, and drops clients that do not read them. With half of
-/// either the same: the rest is read at the next check.
+/// Size of the pieces in which the receiver's data are read, bytes: a TAK server relays everybody's
+/// messages, and drops clients that do not read them. With half of it the same: the rest is read at
+/// the next check.
 const PIECE: usize = 64 << 10;
+/// Most pieces read at one check, 4 MB: a receiver that sends without end must not keep the outlet
+/// from sending. With half of it the same: the rest is read at the next check.
 const MOST_PIECES: usize = 64;
 /// A parent that has not accepted the registration after this long will not do so. With half of it
 /// one that is just starting would be asked again before it has answered.

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use crossfix_geometry::Geodetic;
 use crossfix_message::{Channel, Key, Timestamp, glance};
-use crossfix_outlet::foxglove::{FoxgloveView, Pictures, file_descriptor_set};
+use crossfix_outlet::foxglove::{FoxgloveView, PictureExport, file_descriptor_set};
 use crossfix_transport::{NetworkConfig, Received, Role};
 use foxglove::{ChannelBuilder, Context, PartialMetadata, RawChannel, Schema, WebSocketServer};
 
@@ -22,7 +22,7 @@ const POLL: Duration = Duration::from_millis(50);
 /// Messages queued for a slow client before its oldest are dropped; no other client waits for it.
 /// With half of it a client that pauses loses messages after half of the time.
 const WAITING: usize = 256;
-/// Most topics served; more is taken for an attack. With half as many the same: a hundred cameras
+/// Most topics served; more counts as an attack. With half as many the same: a hundred cameras
 /// have some hundreds.
 const MOST_TOPICS: usize = 10_000;
 
@@ -100,7 +100,7 @@ pub fn serve(
     let subscription = link.subscribe(&[Key::everything_of(link.site())])?;
     output::line(format!("Foxglove: open ws://{}:{}", address.ip(), server.port()));
     let mut served = Served { context, channels: BTreeMap::new() };
-    let mut view = FoxgloveView::new(&network.site, anchor, Pictures::Said);
+    let mut view = FoxgloveView::new(&network.site, anchor, PictureExport::Said);
     while !shutdown.requested() {
         if let Some(received) = subscription.next(POLL) {
             served.take(&mut view, &received)?;

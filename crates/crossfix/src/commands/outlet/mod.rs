@@ -9,7 +9,6 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
-use crossfix_geometry::Geodetic;
 use crossfix_message::{
     CameraCalibration, Channel, Key, SiteName, Timestamp, TrackEvent, TrackFrame, decode,
 };
@@ -20,6 +19,8 @@ use crossfix_transport::{Received, Role};
 
 use self::carrier::{Carrier, Destination};
 use self::tls::TlsFiles;
+use crate::commands::anchor::AnchorArg;
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::config;
 use crate::network;
@@ -34,42 +35,36 @@ const POLL: Duration = Duration::from_millis(20);
 /// With half of it targets would be said to be left out that such receivers still show.
 const STALE_S: f64 = 10.0;
 /// Most events kept for a receiver that is not there; the oldest are dropped. With half as many one
-/// that comes back hears of the last 500 alone.
+/// that comes back gets only the last 500.
 const MOST_EVENTS: usize = 1000;
 
-/// Tell programs of others where the targets are, live.
+/// Send the targets' positions to other programs, live.
 ///
-/// cot: Cursor on Target, for TAK. sapient: BSI Flex 335 v2.0. asterix: category 062. geojson: a
-/// collection a line. foxglove: a server that Foxglove connects to. What each says of its
+/// cot: Cursor on Target, for TAK. sapient: BSI Flex 335 v2.0. asterix: category 062. geojson: one
+/// collection per line. foxglove: a server that Foxglove connects to. How each states the
 /// uncertainty is in docs/outlets.md.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix outlet cot -c my-site/network.toml --to udp://239.2.3.1:6969\n  \
-    crossfix outlet sapient -c my-site/network.toml --to tcp://10.0.0.9:5020\n  \
-    crossfix outlet geojson -c my-site/network.toml\n  \
-    crossfix outlet foxglove -c my-site/network.toml --listen 127.0.0.1:8765")]
+#[command(after_help = examples(&[
+    "crossfix outlet cot -c my-site/network.toml --to udp://239.2.3.1:6969",
+    "crossfix outlet sapient -c my-site/network.toml --to tcp://10.0.0.9:5020",
+    "crossfix outlet geojson -c my-site/network.toml",
+    "crossfix outlet foxglove -c my-site/network.toml --listen 127.0.0.1:8765",
+]))]
 pub struct Args {
     /// The format.
     format: Format,
-    /// The network's file (TOML).
+    /// The network's file (TOML). Its `[anchor]` says where the site is, unless --anchor does.
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Where to: udp://HOST:PORT (multicast too), tcp://HOST:PORT, tls://HOST:PORT, a file, or -
-    /// for stdout.
+    /// Where to send: udp://HOST:PORT (multicast too), tcp://HOST:PORT, tls://HOST:PORT, a file, or
+    /// - for stdout.
     #[arg(long, value_name = "DESTINATION", default_value = "-")]
     to: Destination,
-    /// How often, a second; by default once, SAPIENT twice, ASTERIX every four seconds.
+    /// How often to send, times per second. Default: 1; SAPIENT 2; ASTERIX 0.25.
     #[arg(long, value_name = "HERTZ", value_parser = numbers::outlet_rate)]
     rate_hz: Option<f64>,
-    /// Where on Earth the site's origin is, in the place of the network file's `[anchor]`: degrees
-    /// north, degrees east, metres above the WGS84 ellipsoid.
-    #[arg(
-        long,
-        value_name = "LAT,LON,HEIGHT",
-        value_parser = numbers::place,
-        allow_hyphen_values = true
-    )]
-    anchor: Option<Geodetic>,
+    #[command(flatten)]
+    origin: AnchorArg,
     #[command(flatten)]
     formats: FormatArgs,
     #[command(flatten)]
@@ -82,11 +77,11 @@ pub struct Args {
     stop_with_stdin: bool,
 }
 
-/// What formats must be told.
+/// What some formats need beside the tracks.
 #[derive(Clone, Debug, clap::Args)]
 pub struct FormatArgs {
-    /// What targets are in Cursor on Target: a-u-A (unknown, in the air) claims nothing more;
-    /// a-u-A-M-H-Q is a rotary drone.
+    /// Type of the targets in Cursor on Target: a-u-A is unknown and in the air, a-u-A-M-H-Q is a
+    /// rotary drone.
     #[arg(long, value_name = "TYPE", default_value = "a-u-A", value_parser = cursor_on_target)]
     pub cot_type: CursorOnTarget,
     /// The data source in ASTERIX: system area code and system identification code.
@@ -145,15 +140,15 @@ impl Args {
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
     let network = config::load_network(&args.config)?;
-    let anchor = args.anchor.or(config::anchor_of(&network)?);
+    let anchor = args.origin.anchor.or(config::anchor_of(&network)?);
     let site = network.site.clone();
     if args.format == Format::Foxglove {
         return foxglove::serve(&network, anchor, args.listen, &shutdown);
     }
     let anchor = anchor.with_context(|| {
         format!(
-            "where on Earth is the site? Give {} a section [anchor] with latitude_deg, longitude_deg \
-             and height_m, or --anchor",
+            "where on Earth is the site? Give {} a section [anchor] with latitude_deg, \
+             longitude_deg and height_m, or --anchor",
             args.config.display()
         )
     })?;
@@ -184,7 +179,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut said_at = Instant::now();
     while !shutdown.requested() {
         if let Some(received) = subscription.next(POLL) {
-            heard.hear(&received);
+            heard.take(&received);
         }
         carrier.listen(&mut *outlet)?;
         if said_at.elapsed() >= period {
@@ -221,11 +216,11 @@ impl OutletNews {
         let off_s = wall_seconds() - Timestamp::from_nanos(frame.time_ns).seconds();
         if off_s.abs() > STALE_S {
             self.repeats.warn("time", now, || {
+                let direction = if off_s > 0.0 { "behind" } else { "ahead of" };
                 format!(
-                    "the site's time is {:.0} s {} this host's clock: programs that hold it against theirs \
-                     leave its targets out",
+                    "the site's time is {:.0} s {direction} this host's clock: programs that \
+                     compare it with theirs leave its targets out",
                     off_s.abs(),
-                    if off_s > 0.0 { "behind" } else { "ahead of" }
                 )
             });
         }
@@ -233,18 +228,18 @@ impl OutletNews {
 
     /// Takes in a message. Messages of another version are ignored: viewer and recorder report
     /// them.
-    fn hear(&mut self, received: &Received) {
+    fn take(&mut self, received: &Received) {
         match received.key.channel {
             Channel::Tracks => {
                 if let Ok(frame) = decode::<TrackFrame>(&received.data) {
                     self.tracks_at = received.at;
                     self.check_time(&frame, received.at);
-                    self.situation.hear(received.key.area.as_ref(), &frame);
+                    self.situation.add_tracks(received.key.area.as_ref(), &frame);
                 }
             }
             Channel::Calibration(_) => {
                 if let Ok(calibration) = decode::<CameraCalibration>(&received.data) {
-                    self.situation.hear_calibration(&calibration);
+                    self.situation.add_calibration(&calibration);
                 }
             }
             Channel::Events => {

@@ -1,6 +1,6 @@
 //! A plan as a map: GeoJSON (RFC 7946), WGS84.
 
-use crossfix_evaluation::bound::{Cell, PlannedCamera};
+use crossfix_evaluation::bound::{CandidatePlace, Cell, PlannedCamera};
 use crossfix_geometry::{Geodetic, LocalFrame};
 use nalgebra::Point3;
 use serde_json::{Value, json};
@@ -58,14 +58,17 @@ pub fn collection(report: &PlanReport, cameras: &[PlannedCamera], anchor: Geodet
         point(&frame, camera.camera.pose().position(), &properties)
     }));
     let candidates = report.advice.iter().flat_map(|advice| &advice.candidates).enumerate();
-    features.extend(candidates.map(|(rank, candidate)| {
-        let properties = json!({
-            "kind": "candidate",
-            "rank": rank + 1,
-            "median_position_sd_m": candidate.score.median_sd_m,
-            "share_with_a_fix": candidate.score.fixed,
-        });
-        point(&frame, candidate.position_m.into(), &properties)
-    }));
+    features.extend(candidates.map(|(index, one)| candidate(&frame, index + 1, one)));
     json!({ "type": "FeatureCollection", "features": features })
+}
+
+/// A place for one more camera; the best has rank 1.
+fn candidate(frame: &LocalFrame, rank: usize, place: &CandidatePlace) -> Value {
+    let properties = json!({
+        "kind": "candidate",
+        "rank": rank,
+        "median_position_sd_m": place.score.median_sd_m,
+        "share_with_a_fix": place.score.fixed,
+    });
+    point(frame, place.position_m.into(), &properties)
 }

@@ -7,10 +7,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_evaluation::bound::{Assumptions, PlannedCamera, TargetSize, Volume};
-use crossfix_geometry::{Camera, Geodetic};
+use crossfix_geometry::Camera;
 use nalgebra::Point3;
 
 use self::report::PlanReport;
+use crate::commands::anchor::AnchorArg;
+use crate::commands::examples;
 use crate::commands::numbers::{self, triple};
 use crate::config;
 use crate::output::{self, Draft, Misuse};
@@ -22,10 +24,11 @@ use crate::planned;
 /// straight: no tracker is better, and a good one is near it. Only the cameras' files and their
 /// intrinsics are read; neither videos nor a network need be there.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix plan configs/site --target-size 1\n  \
-    crossfix plan configs/site --min -80,-80,10 --max 80,80,120 --save plan.rrd\n  \
-    crossfix plan configs/site --geojson plan.geojson --anchor 48.3538,11.7861,490")]
+#[command(after_help = examples(&[
+    "crossfix plan configs/site --target-size 1",
+    "crossfix plan configs/site --min -80,-80,10 --max 80,80,120 --save plan.rrd",
+    "crossfix plan configs/site --geojson plan.geojson --anchor 48.3538,11.7861,490",
+]))]
 pub struct Args {
     /// The site's folder, with a file per camera (TOML).
     #[arg(value_name = "SITE_FOLDER")]
@@ -108,15 +111,8 @@ pub struct Args {
     /// Write the cells, the cameras and the candidates as GeoJSON (WGS84); needs --anchor.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     geojson: Option<PathBuf>,
-    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
-    /// ellipsoid.
-    #[arg(
-        long,
-        value_name = "LAT,LON,HEIGHT",
-        value_parser = numbers::place,
-        allow_hyphen_values = true
-    )]
-    anchor: Option<Geodetic>,
+    #[command(flatten)]
+    origin: AnchorArg,
     /// Write the coloured volume as a picture for Rerun (.rrd).
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
@@ -196,7 +192,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     } else {
         output::line(report::render(&report));
     }
-    if let (Some(path), Some(anchor)) = (&args.geojson, args.anchor) {
+    if let (Some(path), Some(anchor)) = (&args.geojson, args.origin.anchor) {
         let json = serde_json::to_vec(&geojson::collection(&report, &cameras, anchor))?;
         output::write_file(path, &[], &json)?;
         tracing::info!("map written to {}", path.display());

@@ -14,10 +14,10 @@ fn legend(report: &PlanReport) -> String {
     let conclusion = report::conclusion(report).unwrap_or_default();
     format!(
         "**Predicted SD of a target's position**\n\n\
-         A cube is a cell with a fix, in the colours of the scale; bright is good. No cube: fewer than two \
-         cameras see it. A layer can be switched off under `world/volume`.\n\n\
-         The dots are places for one more camera, coloured by the median SD over the volume with it; the \
-         best are named.\n\n{assumed}\n\n**{conclusion}**"
+         A cube is a cell with a fix, in the colours of the scale; bright is good. No cube: fewer \
+         than two cameras see it. A layer can be switched off under `world/volume`.\n\n\
+         The dots are places for one more camera, coloured by the median SD over the volume with \
+         it; the best are named.\n\n{assumed}\n\n**{conclusion}**"
     )
 }
 

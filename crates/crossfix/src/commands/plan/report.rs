@@ -69,10 +69,10 @@ fn place(place: [f64; 3]) -> String {
     format!("({x:.0}, {y:.0}, {z:.0})")
 }
 
-/// The assumptions, a line each.
+/// The assumptions, one per line.
 pub fn assumed(report: &PlanReport) -> String {
-    let taken = &report.assumptions;
-    let target = taken.target.map_or_else(
+    let assumed = &report.assumptions;
+    let target = assumed.target.map_or_else(
         || "targets of any size".to_owned(),
         |target| {
             format!("targets of {} m, seen where they span {} px", target.size_m, target.least_px)
@@ -85,8 +85,8 @@ pub fn assumed(report: &PlanReport) -> String {
         report.step_m,
         place(report.min_m),
         place(report.max_m),
-        taken.speed_mps,
-        taken.window_s,
+        assumed.speed_mps,
+        assumed.window_s,
     )
 }
 
@@ -200,7 +200,8 @@ pub fn render(report: &PlanReport) -> String {
     let mut parts = vec![assumed(report), layer_table(report), camera_table(report)];
     parts.extend(report.smallest_target_m.map(|size| {
         format!(
-            "the smallest target that two cameras see in the volume's middle: {size:.2} m (--target-size)"
+            "the smallest target that two cameras see in the volume's middle: {size:.2} m \
+             (--target-size)"
         )
     }));
     parts.extend(report.advice.as_ref().map(|advice| advice_table(report, advice)));

@@ -16,7 +16,9 @@ use crate::repeats::Repeats;
 /// Writer of a recording to a file.
 pub type FileWriter = RecordingWriter<BufWriter<File>>;
 
+/// Bytes of a megabyte, as disks are sold and as `--rotate-mb` counts.
 const MB: f64 = 1e6;
+/// Bytes of a gigabyte, as disks are sold and as the options with GB count.
 const GB: f64 = 1e9;
 /// Removals stop after this many old recordings in a row whose removal freed no space. With half as
 /// many a disk that frees space late would end them too early; with twice as many twice as many
@@ -30,20 +32,20 @@ const LAST_SHARE: f64 = 0.1;
 /// How large and how long a file gets, and how much all of them may take.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub struct Limits {
-    /// Begin a new file whenever one is so large, MB. Files are named by when they begin:
-    /// today-20261125T221700Z.mcap.
+    /// Begin a new file when the current one has this size, MB. Each file is named after the time
+    /// at which it begins: today-20261125T221700Z.mcap.
     #[arg(long, value_name = "MB", value_parser = numbers::megabytes)]
     rotate_mb: Option<f64>,
-    /// Begin a new file after so many minutes.
+    /// Begin a new file after this many minutes.
     #[arg(long, value_name = "MINUTES", value_parser = numbers::minutes)]
     rotate_min: Option<f64>,
-    /// Remove the oldest of the files that are named so, also those of earlier runs, when together
-    /// they take more, GB.
+    /// Most disk space for all files of that name, also those of earlier runs, GB: the oldest ones
+    /// are removed when they take more.
     #[arg(long, value_name = "GB", value_parser = numbers::quota)]
     quota_gb: Option<f64>,
-    /// What is left free on the disk, GB. With less of it the oldest of these files goes; where
-    /// there is none, pictures are not recorded, and with a tenth of it, nothing but bearings,
-    /// calibrations and tracks.
+    /// Space to leave free on the disk, GB. If there is less, the oldest of these files is removed;
+    /// if none is left to remove, pictures are no longer recorded; and below a tenth of it, only
+    /// bearings, calibrations and tracks are.
     #[arg(long, value_name = "GB", default_value_t = 0.5, value_parser = numbers::gigabytes)]
     leave_free_gb: f64,
 }
@@ -230,7 +232,7 @@ impl RecordFiles {
         }
     }
 
-    /// Free space on the file's disk, bytes; infinite for a pipe or where the system does not tell.
+    /// Free space on the file's disk, bytes; infinite for a pipe or where the system does not say.
     pub fn free(&self) -> f64 {
         let path = self.path();
         if path.exists() && !path.is_file() {
@@ -272,23 +274,33 @@ impl RecordFiles {
         };
         let (stem, extension) = parts(&self.asked);
         let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
-        let mut found: Vec<(usize, String, PathBuf)> = names
+        let mut found: Vec<OlderFile> = names
             .filter_map(|name| {
-                let path = self.asked.with_file_name(&name);
-                // Files of this run are ordered by their end, and are all younger than others.
-                let ended = self.ended.iter().position(|ended| *ended == path);
-                Some((
-                    ended.map_or(0, |place| place + 1),
-                    begins_at(&name, &stem, &extension)?,
-                    path,
-                ))
+                let begins_at = begins_at(&name, &stem, &extension)?;
+                Some(self.older_file(self.asked.with_file_name(name), begins_at))
             })
-            .filter(|(_, _, path)| path != self.path() && path.is_file())
+            .filter(|file| file.path != self.path() && file.path.is_file())
             .collect();
         found.sort();
-        self.older =
-            found.into_iter().rev().map(|(_, _, path)| (path.clone(), bytes(&path))).collect();
+        let youngest_first = found.into_iter().rev();
+        self.older = youngest_first.map(|file| (file.path.clone(), bytes(&file.path))).collect();
     }
+
+    fn older_file(&self, path: PathBuf, begins_at: String) -> OlderFile {
+        let ended = self.ended.iter().position(|ended| *ended == path);
+        OlderFile { ended: ended.map_or(0, |place| place + 1), begins_at, path }
+    }
+}
+
+/// A file of the recorder that is not written any more; the oldest come first.
+#[derive(PartialEq, Eq, PartialOrd, Ord)]
+struct OlderFile {
+    /// Its place among the files of this run, by their end, from 1; 0 for files of earlier runs,
+    /// which are all older.
+    ended: usize,
+    /// When it begins, as its name says.
+    begins_at: String,
+    path: PathBuf,
 }
 
 /// The time in a file's name between two parts of it, if it is of that form.

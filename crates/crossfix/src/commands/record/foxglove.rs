@@ -2,7 +2,7 @@
 
 use crossfix_geometry::Geodetic;
 use crossfix_message::{SiteName, Timestamp};
-use crossfix_outlet::foxglove::{FoxgloveView, Pictures, file_descriptor_set};
+use crossfix_outlet::foxglove::{FoxgloveView, PictureExport, file_descriptor_set};
 use crossfix_recording::{Beside, Entry, RecordingError, RecordingWriter};
 
 /// What of a site is written in Foxglove's schemas.
@@ -21,8 +21,8 @@ impl WithFoxglove {
     /// The view that converts messages, if any are to be converted.
     pub fn view(self, site: &SiteName, anchor: Option<Geodetic>) -> Option<FoxgloveView> {
         let pictures = match self {
-            Self::All => Pictures::Said,
-            Self::Site => Pictures::LeftOut,
+            Self::All => PictureExport::Said,
+            Self::Site => PictureExport::LeftOut,
             Self::None => return None,
         };
         Some(FoxgloveView::new(site, anchor, pictures))

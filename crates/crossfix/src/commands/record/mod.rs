@@ -18,6 +18,7 @@ use self::foxglove::WithFoxglove;
 use self::pictures::VideoArgs;
 use self::recorder::Recorder;
 use self::syncing::Syncing;
+use crate::commands::examples;
 use crate::config;
 use crate::health::{self, HealthArgs, HealthReporter};
 use crate::lookout::Lookout;
@@ -29,7 +30,8 @@ use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 /// How long the disk may take to store the end of the last file. With half of it a power cut soon
 /// after the end may cost the last second on a slow disk.
 const SYNCED_WITHIN: Duration = Duration::from_millis(300);
-/// Most old recordings that are removed before the first file begins.
+/// Most old recordings that are removed before the first file begins: on a slow disk a hundred take
+/// seconds. With half as many a disk that others have filled may have no room at the start.
 const MOST_AT_START: u32 = 100;
 /// How long it waits for a message before it checks whether to stop. With twice as much a stop may
 /// come a tenth of a second late.
@@ -37,27 +39,27 @@ const POLL: Duration = Duration::from_millis(50);
 
 /// Record everything that a site publishes.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix record -c configs/site/network.toml -o today.mcap\n  \
-    crossfix record -c configs/site/network.toml -o site.mcap --rotate-min 10 --quota-gb 200")]
+#[command(after_help = examples(&[
+    "crossfix record -c configs/site/network.toml -o today.mcap",
+    "crossfix record -c configs/site/network.toml -o site.mcap --rotate-min 10 --quota-gb 200",
+]))]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// The recording (MCAP) to write. If it is there already it stays, and a new one is written
-    /// beside it: today-2.mcap.
+    /// The recording (MCAP) to write. An existing file is kept: the new one is then called, for
+    /// example, today-2.mcap.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Replace a recording that is there already.
+    /// Replace an existing recording.
     #[arg(long)]
     overwrite: bool,
     #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
     video: VideoArgs,
-    /// What is written a second time in Foxglove's schemas, so that the files open in Foxglove and
-    /// Rerun without Crossfix: all of cameras, pictures and tracks; the site without pictures,
-    /// which are most of a recording; or none.
+    /// What to write a second time in Foxglove's schemas, so that the files open in Foxglove and
+    /// Rerun without Crossfix. Pictures are the largest part of a recording.
     #[arg(long, value_enum, default_value_t)]
     foxglove: WithFoxglove,
     #[command(flatten)]
@@ -193,7 +195,7 @@ fn work(
                     "the recorder reads its configuration at its start alone: restart it"
                 );
             }
-            lookout.look(said_at);
+            lookout.check(said_at);
             let kept = match recorder.health(subscription.refused(), false, reporter) {
                 Ok(health) => {
                     reporter.say(&health)?;

@@ -14,7 +14,7 @@ const MOST_WAITING_BYTES: usize = 64 << 20;
 /// Which pictures are recorded.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Wanted {
-    /// Those of some seconds before a track is sure, until some seconds after it was last.
+    /// Those from some seconds before a track is confirmed until some seconds after it is lost.
     Tracks,
     /// All.
     #[default]
@@ -26,10 +26,10 @@ pub enum Wanted {
 /// Which pictures are recorded.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub struct VideoArgs {
-    /// Record the cameras' pictures always, never, or round the time of a track.
+    /// Which of the cameras' pictures to record.
     #[arg(long, value_enum, default_value_t)]
     video: Wanted,
-    /// With --video tracks: from so long before the track is sure, seconds.
+    /// With --video tracks: begin this long before a track is confirmed, seconds.
     #[arg(
         long,
         value_name = "SECONDS",
@@ -37,7 +37,7 @@ pub struct VideoArgs {
         value_parser = numbers::seconds_of_an_hour
     )]
     video_before_s: f64,
-    /// With --video tracks: until so long after it was last seen, seconds.
+    /// With --video tracks: end this long after a track was last seen, seconds.
     #[arg(
         long,
         value_name = "SECONDS",
@@ -95,7 +95,7 @@ impl<P> Pictures<P> {
         self.left_out
     }
 
-    /// Takes a picture of so many bytes in: returns it if it is to be recorded now; otherwise it
+    /// Takes in a picture of `bytes` bytes: returns it if it is to be recorded now; otherwise it
     /// waits or is left out.
     pub fn take(&mut self, picture: P, bytes: usize, now: Instant) -> Option<P> {
         match self.wanted {

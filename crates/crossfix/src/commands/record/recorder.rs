@@ -17,9 +17,9 @@ use crate::network::rivalry;
 use crate::pace::wall_seconds;
 use crate::repeats::Repeats;
 
-/// Most bytes of messages held back until data tell the data time: what a site of a hundred cameras
+/// Most bytes of messages kept until data set the data time: what a site of a hundred cameras
 /// sends without data in minutes. Further ones are recorded with the time of their arrival.
-const MOST_HELD_BYTES: usize = 8 << 20;
+const MOST_EARLY_BYTES: usize = 8 << 20;
 
 /// Decides what to record of each message; uses no clock but the messages' arrival times, and no
 /// network.
@@ -29,11 +29,11 @@ pub struct Recorder {
     run: RunId,
     network: NetworkConfig,
     times: DataTime,
-    held: Vec<Entry>,
-    held_bytes: usize,
+    early: Vec<Entry>,
+    early_bytes: usize,
     reception: Reception,
     repeats: Repeats,
-    counts: Counts,
+    counts: UnrecordedCounts,
     /// What each file must begin with: the cameras' newest calibrations, and the fusion centre's
     /// newest message on their clocks.
     standing: BTreeMap<Key, Entry>,
@@ -48,7 +48,7 @@ pub struct Recorder {
 
 /// Counts of messages that were not recorded, or not as they should be.
 #[derive(Clone, Copy, Debug, Default)]
-struct Counts {
+struct UnrecordedCounts {
     /// From cameras and fusion centres that the network's file does not name.
     foreign: u64,
     malformed: u64,
@@ -97,11 +97,11 @@ impl Recorder {
             run,
             network: network.clone(),
             times: DataTime::default(),
-            held: Vec::new(),
-            held_bytes: 0,
+            early: Vec::new(),
+            early_bytes: 0,
             reception: Reception::default(),
             repeats: Repeats::default(),
-            counts: Counts::default(),
+            counts: UnrecordedCounts::default(),
             standing: BTreeMap::new(),
             pictures: Pictures::new(video),
             foxglove,
@@ -194,7 +194,8 @@ impl Recorder {
             self.counts.newer += 1;
             self.repeats.warn(&format!("newer {key}"), at, || {
                 format!(
-                    "`{key}` from {sender} is of a newer version: recorded, but this build cannot read it"
+                    "`{key}` from {sender} is of a newer version: recorded, but this build cannot \
+                     read it"
                 )
             });
             self.times.now()
@@ -232,9 +233,9 @@ impl Recorder {
                 self.release(data_time)?;
                 self.put(&Entry { data_time, ..entry })
             }
-            Said::BeforeAnyData if self.held_bytes < MOST_HELD_BYTES => {
-                self.held_bytes += entry.data.len();
-                self.held.push(entry);
+            Said::BeforeAnyData if self.early_bytes < MOST_EARLY_BYTES => {
+                self.early_bytes += entry.data.len();
+                self.early.push(entry);
                 Ok(())
             }
             Said::BeforeAnyData => self.put(&Entry { data_time: entry.arrival, ..entry }),
@@ -243,9 +244,9 @@ impl Recorder {
 
     /// Records the messages from before the first data, at the time of the first data.
     fn release(&mut self, now: Timestamp) -> Result<(), RecordingError> {
-        self.held_bytes = 0;
-        for held in std::mem::take(&mut self.held) {
-            self.put(&Entry { data_time: now.max(held.data_time), ..held })?;
+        self.early_bytes = 0;
+        for entry in std::mem::take(&mut self.early) {
+            self.put(&Entry { data_time: now.max(entry.data_time), ..entry })?;
         }
         Ok(())
     }
@@ -340,9 +341,9 @@ impl Recorder {
     /// [`RecordingError`] if the file cannot be written.
     pub fn finish(mut self) -> Result<(u64, u64), RecordingError> {
         self.repeats.end();
-        // No data ever told the data time, so the arrival by wall clock is used.
-        for held in std::mem::take(&mut self.held) {
-            self.put(&Entry { data_time: held.arrival, ..held })?;
+        // No data ever set the data time, so the arrival by wall clock is used.
+        for entry in std::mem::take(&mut self.early) {
+            self.put(&Entry { data_time: entry.arrival, ..entry })?;
         }
         let (files, messages) = self.before;
         Ok((messages + self.writer.finish()?, files + 1))

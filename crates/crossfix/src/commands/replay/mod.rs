@@ -8,39 +8,41 @@ use anyhow::ensure;
 use crossfix_message::{CameraName, Channel, Key, Timestamp, glance};
 use crossfix_recording::{Entry, RecordingReader};
 
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::output::Misuse;
 use crate::recalibration::Recalibration;
 use crate::recorded::{self, Lacks};
 
-/// Play a recording again: onto Zenoh, or with --fuse straight into the fusion.
+/// Play a recording again: onto the network, or with --fuse straight into the fusion.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix replay recordings/two-uavs.mcap --fuse -o tracks.mcap\n  \
-    crossfix replay recordings/two-uavs.mcap --network configs/site/network.toml \\\n      \
-    --speed 2 --from 5 --to 20")]
+#[command(after_help = examples(&[
+    "crossfix replay recordings/two-uavs.mcap --fuse -o tracks.mcap",
+    "crossfix replay recordings/two-uavs.mcap --network configs/site/network.toml \\\n\
+     --speed 2 --from 5 --to 20",
+]))]
 pub struct Args {
     /// The recording (MCAP).
     recording: PathBuf,
-    /// Fuse the recorded bearings, as fast as it goes, without a network.
+    /// Fuse the recorded bearings, as fast as possible, without a network.
     #[arg(long, requires = "output")]
     fuse: bool,
-    /// The fusion's configuration (TOML); its defaults without.
+    /// The fusion's configuration (TOML); without it, the defaults.
     #[arg(short, long, value_name = "FILE", requires = "fuse")]
     config: Option<PathBuf>,
-    /// The site's calibration (TOML, by crossfix calibrate) in the place of what was recorded:
-    /// bearings are made anew from the recorded pixels, and times corrected.
+    /// Use this calibration of the site (TOML, by crossfix calibrate) instead of the recorded one:
+    /// bearings are computed again from the recorded pixels, and times are corrected.
     #[arg(long, value_name = "FILE", requires = "fuse")]
     calibration: Option<PathBuf>,
     /// Override a key of the configuration, e.g. event_time.lateness_s=1.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "fuse")]
     sets: Vec<String>,
-    /// Let each state of a track wait this long for the bearings after it that tell of it, seconds:
-    /// the tracks that are written are smoothed, and their velocities about twice as good.
+    /// Write smoothed tracks: each state waits this long for later bearings and uses them, seconds.
+    /// Velocities become about twice as good.
     #[arg(long, value_name = "SECONDS", requires = "fuse", value_parser = numbers::lag)]
     smooth: Option<f64>,
-    /// The recording (MCAP) to write: all that was recorded, with the new tracks in place of the
-    /// old.
+    /// The recording (MCAP) to write: everything that was recorded, with the new tracks instead of
+    /// the old ones.
     #[arg(short, long, value_name = "FILE", requires = "fuse")]
     output: Option<PathBuf>,
     /// Start this long after the first bearing, seconds of data time.
@@ -49,10 +51,10 @@ pub struct Args {
     /// End this long after the first bearing, seconds of data time.
     #[arg(long, value_name = "SECONDS", value_parser = numbers::seconds)]
     to: Option<f64>,
-    /// The network's file (TOML) to publish on; the replay stands in for the site's cameras.
+    /// The file (TOML) of the network to publish on; the replay stands in for the site's cameras.
     #[arg(long, value_name = "FILE", conflicts_with = "fuse", required_unless_present = "fuse")]
     network: Option<PathBuf>,
-    /// How much faster than in life it is played onto the network; 0 is as fast as it goes.
+    /// Playing speed on the network: 1 is real time, 2 twice as fast, 0 as fast as possible.
     #[arg(
         long,
         default_value_t = 1.0,
@@ -61,7 +63,7 @@ pub struct Args {
         value_parser = numbers::speed
     )]
     speed: f64,
-    /// Begin again at the end, until Ctrl-C; times go on.
+    /// Start again at the end, until Ctrl-C; times continue from pass to pass.
     #[arg(long = "loop", conflicts_with = "fuse")]
     again: bool,
     /// Publish the recorded tracks too, and stand in for the fusion centre.
@@ -71,7 +73,7 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let recalibration = args.calibration.as_deref().map(Recalibration::load).transpose()?;
-    let (range, contents) = Range::of(args, recalibration.as_ref())?;
+    let (range, contents) = TimeRange::of(args, recalibration.as_ref())?;
     match (&args.output, &args.network) {
         (Some(output), _) => offline::fuse(args, output, range, recalibration),
         (None, Some(network)) => online::publish(args, network, range, &contents),
@@ -104,14 +106,14 @@ impl Contents {
 
 /// A range of data time.
 #[derive(Clone, Copy, Debug)]
-struct Range {
+struct TimeRange {
     from: Timestamp,
     to: Timestamp,
     /// Whether it is the whole recording.
     is_whole: bool,
 }
 
-impl Range {
+impl TimeRange {
     /// The range that was asked for, counted from the recording's first bearing or track, and what
     /// the recording holds; that is not looked at where all of it is fused.
     fn of(args: &Args, recalibration: Option<&Recalibration>) -> anyhow::Result<(Self, Contents)> {
@@ -163,7 +165,7 @@ impl Range {
 
 /// The calibrations valid at a range's beginning, ordered by key: each camera's last one before it,
 /// or else its first.
-fn calibrations(recording: &Path, range: Range) -> anyhow::Result<Vec<Entry>> {
+fn calibrations(recording: &Path, range: TimeRange) -> anyhow::Result<Vec<Entry>> {
     let is_calibration = |key: &Key| matches!(key.channel, Channel::Calibration(_));
     let cameras =
         RecordingReader::open(recording)?.keys().filter(|key| is_calibration(key)).count();

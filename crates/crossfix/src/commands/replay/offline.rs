@@ -8,7 +8,7 @@ use crossfix_fusion::Output;
 use crossfix_message::{Channel, Key, Payload, SiteName, Timestamp, TrackEventKind};
 use crossfix_recording::{Entry, RecordingWriter, Source};
 
-use super::{Args, Range, calibrations};
+use super::{Args, TimeRange, calibrations};
 use crate::centre::Centre;
 use crate::config::FusionFile;
 use crate::output::{self, Draft};
@@ -25,8 +25,8 @@ struct OfflineFusion {
     centre: Centre,
     writer: RecordingWriter<std::io::BufWriter<std::fs::File>>,
     /// What of the recording is fused.
-    range: Range,
-    /// Data time of the first entry taken, and the latest.
+    range: TimeRange,
+    /// Data time of the first entry used, and of the latest.
     first: Option<Timestamp>,
     until: Timestamp,
     frames: u64,
@@ -45,7 +45,7 @@ struct OfflineFusion {
 pub fn fuse(
     args: &Args,
     output: &Path,
-    range: Range,
+    range: TimeRange,
     recalibration: Option<Recalibration>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
@@ -91,7 +91,7 @@ pub fn fuse(
 }
 
 /// What was found in a recording.
-struct Found {
+struct ReplaySummary {
     frames: u64,
     /// Number of tracks that were confirmed.
     targets: u64,
@@ -101,7 +101,7 @@ struct Found {
     why_nothing: Option<String>,
 }
 
-impl Found {
+impl ReplaySummary {
     fn ensure_any(&self) -> anyhow::Result<()> {
         let why = self.why_nothing.as_ref().map_or_else(String::new, |why| format!(": {why}"));
         ensure!(self.targets > 0, "no target found in {} bearing frames{why}", self.frames);
@@ -110,7 +110,7 @@ impl Found {
 }
 
 impl OfflineFusion {
-    fn begin(args: &Args, file: FusionFile, range: Range, path: &Path) -> anyhow::Result<Self> {
+    fn begin(args: &Args, file: FusionFile, range: TimeRange, path: &Path) -> anyhow::Result<Self> {
         let config = file.fusion().smoothed(args.smooth);
         let is_smoothed = config.tracking.smoothing_s > 0.0;
         let centre = Centre::new(config, file.cameras)?;
@@ -210,7 +210,7 @@ impl OfflineFusion {
         Ok(())
     }
 
-    fn finish(mut self, args: &Args, path: &Path) -> anyhow::Result<Found> {
+    fn finish(mut self, args: &Args, path: &Path) -> anyhow::Result<ReplaySummary> {
         let last = self.centre.flush();
         self.write(last)?;
         self.write_health(self.centre.now(), true)?;
@@ -240,7 +240,7 @@ impl OfflineFusion {
             self.busy.as_secs_f64() * 1e6 / frames as f64,
             self.longest.as_secs_f64() * 1e3
         ));
-        Ok(Found {
+        Ok(ReplaySummary {
             frames,
             targets: self.targets,
             lasts_s: self.until.seconds_since(self.first.unwrap_or(self.until)),

@@ -1,18 +1,19 @@
 //! Replay onto the network, in real time or faster.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::Path;
 use std::time::Duration;
 
 use anyhow::ensure;
 use crossfix_message::{
     BearingFrame, CameraName, Channel, CueFrame, Health, Key, Payload, Preview, Timestamp,
-    TrackEvent, TrackFrame, TruthFrame, decode,
+    TrackEvent, TrackFrame, TruthFrame, decode, glance,
 };
 use crossfix_recording::Entry;
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
 
-use super::{Args, Contents, Range};
+use super::{Args, Contents, TimeRange};
 use crate::config;
 use crate::network;
 use crate::output;
@@ -44,7 +45,7 @@ fn is_cameras(channel: &Channel) -> bool {
 pub fn publish(
     args: &Args,
     network: &Path,
-    range: Range,
+    range: TimeRange,
     contents: &Contents,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
@@ -59,6 +60,7 @@ pub fn publish(
     let delivery = if args.speed > 0.0 { Delivery::Queued } else { Delivery::Every };
     let mut stage =
         Stage { link, delivery, publishers: BTreeMap::new(), alive: Vec::new(), published: 0 };
+    let mut left_out = LeftOut::default();
     stage.appear(&network, args.tracks)?;
     let mut pass = Pass { goes_on: args.again, ..Pass::default() };
     // The run-up takes the same time at any speed.
@@ -69,8 +71,11 @@ pub fn publish(
             let before = stage.published;
             recorded::for_each_until(&args.recording, &mut lacks, &shutdown, |_, entry| {
                 let wanted = range.holds(&entry) && (args.tracks || is_cameras(&entry.key.channel));
+                if !wanted || !left_out.admits(&entry, &network) {
+                    return Ok(());
+                }
                 let since_s = entry.data_time.seconds_since(range.from) + pass.by_s;
-                if wanted && pace.wait(since_s, &shutdown) {
+                if pace.wait(since_s, &shutdown) {
                     stage.put(pass.shifted(entry))?;
                 }
                 Ok(())
@@ -91,8 +96,47 @@ pub fn publish(
     std::thread::sleep(Duration::from_millis(200));
     drop((publishers, alive));
     link.close(if shutdown.requested() { LEAVE } else { LONG_LEAVE })?;
-    output::line(format!("{published} messages published"));
+    output::line(format!("{published} messages published{left_out}"));
     Ok(())
+}
+
+/// Counts of the messages that are not published, because nobody on the network would use them.
+#[derive(Debug, Default)]
+struct LeftOut {
+    /// From cameras that the network's file does not name.
+    foreign: u64,
+    /// Damaged, or of a newer major version.
+    unreadable: u64,
+}
+
+impl LeftOut {
+    /// Whether a message is of use on the network; counts it here if it is not.
+    fn admits(&mut self, entry: &Entry, network: &NetworkConfig) -> bool {
+        let camera = entry.key.channel.camera();
+        if camera.is_some_and(|camera| !network.cameras.contains_key(camera)) {
+            self.foreign += 1;
+            return false;
+        }
+        let seen = glance(&entry.key.channel, &entry.data);
+        let is_readable = seen.is_ok_and(|seen| seen.is_none_or(|seen| seen.is_readable));
+        self.unreadable += u64::from(!is_readable);
+        is_readable
+    }
+}
+
+impl fmt::Display for LeftOut {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let reasons = [
+            (self.foreign, "of cameras that the network's file does not name"),
+            (self.unreadable, "that cannot be read: damaged, or of a newer version"),
+        ];
+        let mut separator = "; left out: ";
+        for (count, reason) in reasons.into_iter().filter(|(count, _)| *count > 0) {
+            write!(f, "{separator}{count} {reason}")?;
+            separator = ", ";
+        }
+        Ok(())
+    }
 }
 
 /// Refuses a recording of which nobody on the network would hear or read anything, and says what

@@ -14,10 +14,11 @@ use crate::shutdown::Shutdown;
 /// Time between the server's start and the first frame, s: clients should connect before it. With
 /// half of it those that take longer miss the first frames.
 pub const RUN_UP_S: f64 = 1.0;
-/// When a camera first reports what its clock shows, s after its start, and the interval of further
-/// reports, s; both as real cameras do. With half of them clocks would be known sooner than real
-/// ones are.
+/// When a camera first reports what its clock shows, s after its start, as real cameras do. With
+/// half of it clocks would be known sooner than real ones are.
 const FIRST_REPORT_S: f64 = 2.5;
+/// Interval of further reports, s, as of real cameras. With half of it clocks would be followed
+/// more closely than real ones are.
 const REPORT_EVERY_S: f64 = 5.0;
 /// Ticks per second of a stream's time stamps, Hz.
 const TICKS_HZ: f64 = 90_000.0;

@@ -82,7 +82,7 @@ impl SiteArgs {
             cameras: self.cameras,
             rate_hz: self.rate_hz,
             detection_probability: self.detection_probability,
-            clutter: self.clutter,
+            false_bearings: self.clutter,
             ..Site::default()
         }
     }
@@ -203,7 +203,7 @@ fn camera(
         "R_world_from_cam": rows,
         "sigma_rad": site.noise_rad,
         "pd": site.detection_probability,
-        "clutter_mean": site.clutter,
+        "clutter_mean": site.false_bearings,
         "clutter_window_rad": [-width, width, -height, height],
         "phase_s": phase_s,
     })
@@ -219,8 +219,9 @@ mod tests {
     #[test]
     fn what_is_written_is_imported_as_it_was() {
         let dir = tempfile::tempdir().unwrap();
-        let site =
-            Site { duration_s: 1.0, targets: 5, clutter: 2.0, ..Site::default() }.build().unwrap();
+        let site = Site { duration_s: 1.0, targets: 5, false_bearings: 2.0, ..Site::default() }
+            .build()
+            .unwrap();
         assert_eq!(write(&site, dir.path(), &Shutdown::listen()).unwrap(), 120);
         let entries = scenario::read(dir.path()).unwrap();
         let mut frames = Vec::new();

@@ -23,9 +23,10 @@ const TRACK_LIVES: Duration = Duration::from_secs(2);
 /// at 5000.
 const MOST_TRACKS: usize = 10_000;
 
-/// Most problems shown of one component, and characters of each. With half of either the last of
-/// many, or the end of a long one, would be missing.
+/// Most problems shown of one component. With half of it the last of many would be missing.
 const MOST_PROBLEMS: usize = 10;
+/// Most characters shown of a problem: two lines of a terminal. With half of it the end of a long
+/// one would be missing.
 const MOST_LETTERS: usize = 200;
 
 /// Text from elsewhere as one line without control characters, which could affect the terminal.
@@ -65,7 +66,7 @@ pub struct ComponentRow {
     pub memory_mb: Option<f64>,
     /// Temperature of the hottest part of its host, degrees Celsius.
     pub temperature_c: Option<f64>,
-    /// Problems that a person should look at.
+    /// Problems that need a person's attention.
     pub problems: Vec<String>,
 }
 
@@ -106,7 +107,7 @@ impl Board {
     }
 
     /// Takes a message in; one that cannot be read is ignored.
-    pub fn hear(&mut self, key: &Key, data: &[u8], at: Instant) {
+    pub fn take(&mut self, key: &Key, data: &[u8], at: Instant) {
         let name = match &key.channel {
             Channel::CameraHealth(camera) if self.cameras.contains(camera) => camera.to_string(),
             Channel::FusionHealth => {
@@ -238,11 +239,13 @@ impl Status {
     }
 }
 
+/// A number of the table; nothing where it is not known.
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or(String::new(), |value| format!("{value:.digits$}"))
+}
+
 impl ComponentRow {
     fn row(&self) -> Vec<String> {
-        let number = |value: Option<f64>, digits: usize| {
-            value.map_or(String::new(), |value| format!("{value:.digits$}"))
-        };
         let clock = match (self.clock_ms, self.clock_sd_ms) {
             (Some(ahead), Some(sd)) => format!("{ahead:+.1} ± {sd:.1}"),
             _ => String::new(),
@@ -296,9 +299,9 @@ mod tests {
             tracks: 2,
             ..Default::default()
         };
-        board.hear(&of("north"), &north.encode(), begun);
+        board.take(&of("north"), &north.encode(), begun);
         // A message from no camera of the site.
-        board.hear(&of("stranger"), &north.encode(), begun);
+        board.take(&of("stranger"), &north.encode(), begun);
         let clock = CameraHealth {
             camera: "north".into(),
             standing: CameraStanding::Good.into(),
@@ -307,8 +310,8 @@ mod tests {
             ..Default::default()
         };
         let fusion = Health { cameras: vec![clock], rate_hz: 80.0, ..Default::default() };
-        board.hear(&key(Channel::FusionHealth), &fusion.encode(), begun + Duration::from_secs(3));
-        board.hear(&key(Channel::FusionHealth), &[0xff; 9], begun + Duration::from_secs(3));
+        board.take(&key(Channel::FusionHealth), &fusion.encode(), begun + Duration::from_secs(3));
+        board.take(&key(Channel::FusionHealth), &[0xff; 9], begun + Duration::from_secs(3));
         let status = board.status(begun + Duration::from_secs(1));
         let names: Vec<&str> = status.parts.iter().map(|part| part.name.as_str()).collect();
         assert_eq!(names, ["east", "north", "fusion"]);
@@ -328,23 +331,27 @@ mod tests {
         let (mut board, begun) = (board(), Instant::now());
         let track =
             |id: u64, state: TrackState| Track { id, state: state.into(), ..Default::default() };
-        let tell = |board: &mut Board, tracks: Vec<Track>, at: Instant| {
-            board.hear(
+        let take_tracks = |board: &mut Board, tracks: Vec<Track>, at: Instant| {
+            board.take(
                 &key(Channel::Tracks),
                 &TrackFrame { tracks, ..Default::default() }.encode(),
                 at,
             );
         };
         let both = vec![track(1, TrackState::Confirmed), track(2, TrackState::OneCamera)];
-        tell(&mut board, both, begun);
-        tell(&mut board, vec![track(3, TrackState::Coasting)], begun + Duration::from_secs(1));
+        take_tracks(&mut board, both, begun);
+        take_tracks(
+            &mut board,
+            vec![track(3, TrackState::Coasting)],
+            begun + Duration::from_secs(1),
+        );
         let counted = |board: &Board, seconds: u64| {
             let status = board.status(begun + Duration::from_secs(seconds));
             (status.confirmed, status.one_camera)
         };
         assert_eq!(counted(&board, 1), (2, 1));
         assert_eq!(counted(&board, 2), (1, 0));
-        tell(&mut board, vec![track(3, TrackState::Lost)], begun + Duration::from_secs(2));
+        take_tracks(&mut board, vec![track(3, TrackState::Lost)], begun + Duration::from_secs(2));
         assert_eq!(counted(&board, 2), (0, 0));
     }
 }

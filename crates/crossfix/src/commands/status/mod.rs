@@ -13,6 +13,7 @@ use crossfix_transport::{Link, NetworkConfig, Role};
 use self::board::Board;
 use self::page::{Page, PageEvent};
 use self::plan::PlanBoard;
+use crate::commands::examples;
 use crate::config;
 use crate::network;
 use crate::output;
@@ -34,9 +35,10 @@ const CLEARED: &str = "\x1b[H\x1b[2J";
 ///
 /// On a terminal until Ctrl-C; else, or with --once or --json, what is heard in three seconds.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix status -c configs/site/network.toml\n  \
-    crossfix status -c configs/site/network.toml --page 127.0.0.1:8080")]
+#[command(after_help = examples(&[
+    "crossfix status -c configs/site/network.toml",
+    "crossfix status -c configs/site/network.toml --page 127.0.0.1:8080",
+]))]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
@@ -48,7 +50,7 @@ pub struct Args {
     #[arg(long)]
     json: bool,
     /// Serve a page instead, with a plan of the site, its tracks and what has happened, e.g.
-    /// 127.0.0.1:8080. Whoever reaches the address can look.
+    /// 127.0.0.1:8080. Whoever reaches the address can see it.
     #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["once", "json"])]
     page: Option<SocketAddr>,
     /// Stop when stdin ends.
@@ -108,7 +110,7 @@ fn watch(
     let mut drawn = begun;
     while !shutdown.requested() {
         if let Some(received) = subscription.next(POLL) {
-            board.hear(&received.key, &received.data, received.at);
+            board.take(&received.key, &received.data, received.at);
         }
         if drawn.elapsed() >= PERIOD {
             drawn = Instant::now();
@@ -143,8 +145,8 @@ fn serve(
     let mut shown_at = Instant::now();
     while !shutdown.requested() {
         if let Some(received) = subscription.next(POLL) {
-            board.hear(&received.key, &received.data, received.at);
-            plan.hear(&received.key.channel, &received.data, received.at);
+            board.take(&received.key, &received.data, received.at);
+            plan.take(&received.key.channel, &received.data, received.at);
         }
         if shown_at.elapsed() >= page::PERIOD {
             shown_at = Instant::now();

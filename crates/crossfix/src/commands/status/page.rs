@@ -23,7 +23,7 @@ const PAGE: &str = include_str!("page.html");
 /// Security policy: the page runs its own script and contacts its own server, and nothing else.
 const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
                       connect-src 'self'; img-src data:";
-/// Most clients that receive events at the same time; further ones are told to try again later.
+/// Most clients that receive events at the same time; further ones are asked to try again later.
 /// Other requests need connections of their own ([`http::ASKING`]). With half as many the seventh
 /// client would be told so.
 const TOLD: usize = 12;
@@ -117,7 +117,7 @@ fn answer<B>(
     }
 }
 
-/// The shown states as server-sent events, beginning with the newest, as long as the place is held.
+/// The shown states as server-sent events, beginning with the newest, as long as the place is kept.
 fn events(
     mut shown: watch::Receiver<Bytes>,
     place: OwnedSemaphorePermit,

@@ -83,7 +83,7 @@ impl PlanBoard {
     }
 
     /// Takes a message in; one that cannot be read is ignored.
-    pub fn hear(&mut self, channel: &Channel, data: &[u8], at: Instant) {
+    pub fn take(&mut self, channel: &Channel, data: &[u8], at: Instant) {
         match channel {
             Channel::Calibration(name) if self.known.contains(name) => {
                 let message = decode::<CameraCalibration>(data).ok();

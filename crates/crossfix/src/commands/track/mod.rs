@@ -13,13 +13,14 @@ use crossfix_correlation::Plane;
 use crossfix_video::{Frame, FrameClock, FrameSource, VideoError};
 use crossfix_vision::{DetectorConfig, ImageTracker, PixelBox, TrackerConfig};
 
+use crate::commands::examples;
 use crate::commands::numbers;
 use crate::output::{self, Draft};
 use crate::repeats::Repeats;
 use crate::shutdown::Shutdown;
 use crate::{config, eye};
-use picture::Picture;
-use table::Table;
+use picture::TrackPicture;
+use table::FollowedTable;
 
 /// Follow targets in a video, without a network.
 ///
@@ -30,10 +31,11 @@ use table::Table;
 /// probability that it is there; sd_x, sd_y the standard deviations of its place in pixels; vx, vy
 /// its velocity in pixels per second.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv\n  \
-    crossfix track clip.mp4 --detect --csv clip.csv --save clip.rrd\n  \
-    crossfix track clip.mp4 --from 120 --box 100,80,20,14 --box 310,95,12,9 --csv clip.csv")]
+#[command(after_help = examples(&[
+    "crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv",
+    "crossfix track clip.mp4 --detect --csv clip.csv --save clip.rrd",
+    "crossfix track clip.mp4 --from 120 --box 100,80,20,14 --box 310,95,12,9 --csv clip.csv",
+]))]
 pub struct Args {
     /// The video: .mp4 (H.264), .avi (Motion JPEG), .y4m, or a folder of PNG or JPEG images.
     video: PathBuf,
@@ -100,10 +102,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let draft =
         |path: &Option<PathBuf>| path.as_deref().map(|path| Draft::new(path, &inputs)).transpose();
     let (written, drawn) = (draft(&args.csv)?, draft(&args.save)?);
-    let mut table = Table::new(written.as_ref().map(Draft::path))?;
+    let mut table = FollowedTable::new(written.as_ref().map(Draft::path))?;
     let picture = drawn
         .as_ref()
-        .map(|draft| Picture::new(draft.path(), args.labels.as_deref()))
+        .map(|draft| TrackPicture::new(draft.path(), args.labels.as_deref()))
         .transpose()?;
 
     let counted = follow(args, source.as_mut(), &mut tracker, &mut table, picture.as_ref())?;
@@ -134,9 +136,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What a video held.
+/// What a video contained.
 #[derive(Default)]
-struct Counted {
+struct FrameCounts {
     /// Number of its frames, also of those that were skipped.
     length: u64,
     tracked: u64,
@@ -144,7 +146,7 @@ struct Counted {
     bad: u64,
 }
 
-impl Counted {
+impl FrameCounts {
     fn ensure_usable(&self, args: &Args) -> anyhow::Result<()> {
         let &Self { length, tracked, bad } = self;
         let video = args.video.display();
@@ -164,11 +166,11 @@ fn follow(
     args: &Args,
     source: &mut dyn FrameSource,
     tracker: &mut ImageTracker,
-    table: &mut Table,
-    picture: Option<&Picture>,
-) -> anyhow::Result<Counted> {
+    table: &mut FollowedTable,
+    picture: Option<&TrackPicture>,
+) -> anyhow::Result<FrameCounts> {
     let mut repeats = Repeats::default();
-    let mut counted = Counted::default();
+    let mut counted = FrameCounts::default();
     let shutdown = Shutdown::listen();
     while !shutdown.requested()
         && let Some((index, read)) = next_frame(source, &mut repeats)?

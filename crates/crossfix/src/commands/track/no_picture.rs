@@ -9,9 +9,9 @@ use crossfix_vision::ImageTrack;
 use crate::parts;
 
 /// A picture cannot exist in this build.
-pub(super) enum Picture {}
+pub(super) enum TrackPicture {}
 
-impl Picture {
+impl TrackPicture {
     pub(super) fn new(_: &Path, _: Option<&Path>) -> anyhow::Result<Self> {
         Err(parts::no_pictures())
     }

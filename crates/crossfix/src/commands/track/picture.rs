@@ -13,12 +13,12 @@ use crate::commands::labels::read_labels;
 use crate::eye;
 
 /// A picture of the tracker's work, with labels to compare it with.
-pub(super) struct Picture {
+pub(super) struct TrackPicture {
     picture: TrackingPicture,
     labels: BTreeMap<u64, PixelBox>,
 }
 
-impl Picture {
+impl TrackPicture {
     pub(super) fn new(path: &Path, labels: Option<&Path>) -> anyhow::Result<Self> {
         let labels = labels.map(read_labels).transpose()?.unwrap_or_default();
         Ok(Self { picture: TrackingPicture::new(crossfix_view::save(path)?)?, labels })

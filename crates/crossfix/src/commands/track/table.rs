@@ -7,14 +7,15 @@ use std::path::Path;
 use anyhow::Context;
 use crossfix_vision::{ImageTrack, PixelBox, TrackPhase};
 
+/// Titles of the table's columns, in order; the boxes are in pixels, `us` in microseconds.
 const COLUMNS: [&str; 13] =
     ["frame", "x", "y", "w", "h", "ok", "us", "id", "certainty", "sd_x", "sd_y", "vx", "vy"];
 
-pub(super) struct Table {
+pub(super) struct FollowedTable {
     writer: csv::Writer<Box<dyn Write>>,
 }
 
-impl Table {
+impl FollowedTable {
     /// A table in a file, or on stdout.
     pub(super) fn new(path: Option<&Path>) -> anyhow::Result<Self> {
         let sink: Box<dyn Write> = match path {

@@ -8,12 +8,16 @@ use anyhow::{Context, bail};
 use crossfix_evaluation::{Table, ValidationOptions, validate_fusion, validate_tracker};
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::commands::examples;
 use crate::output;
 
-/// Make the papers' tables and figures again, beside the papers' figures.
+/// Repeat the papers' experiments and print our figures beside theirs.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix validate tracker --runs 1000 --only loss\n  crossfix validate fusion --runs 4000 --only bound"
+    after_help = examples(&[
+        "crossfix validate tracker --runs 1000 --only loss",
+        "crossfix validate fusion --runs 4000 --only bound",
+    ])
 )]
 pub struct Args {
     #[command(subcommand)]
@@ -31,9 +35,10 @@ enum What {
     /// With --ablate: what each part of the tracker brings. The share of frames that are lost with
     /// all parts, and how much more is lost without each, on drawn scenes (noise, masts, wires,
     /// birds, clouds' edges, a pan) and on labelled videos.
-    #[command(after_help = "Examples:\n  \
-                      crossfix validate tracker --runs 1000 --json tracker.json --plots plots\n  \
-                      crossfix validate tracker --ablate --clips videos")]
+    #[command(after_help = examples(&[
+        "crossfix validate tracker --runs 1000 --json tracker.json --plots plots",
+        "crossfix validate tracker --ablate --clips videos",
+    ]))]
     Tracker(TrackerOptions),
     /// The fusion: detection, degenerate geometries, the Cramer-Rao bound, manoeuvres (Klochko
     /// 2020, Kalinov 2019).
@@ -41,7 +46,9 @@ enum What {
     /// Prints each figure with the paper's, a reference implementation's, ours, the Monte Carlo
     /// standard error and, where something is asked of it, pass or fail.
     #[command(
-        after_help = "Example:\n  crossfix validate fusion --runs 4000 --only bound --json fusion.json"
+        after_help = examples(&[
+            "crossfix validate fusion --runs 4000 --only bound --json fusion.json",
+        ])
     )]
     Fusion(Options),
 }
@@ -86,7 +93,7 @@ struct Options {
 /// standard error of up to five per cent.
 const RUNS: u32 = 200;
 /// Scenes of each kind for an ablation, if nothing else is asked. With half of them a part that
-/// brings a per cent is seldom told from none.
+/// brings a per cent can seldom be distinguished from none.
 const SCENES: u32 = 10;
 
 pub fn run(what: &Args) -> anyhow::Result<()> {
@@ -94,11 +101,7 @@ pub fn run(what: &Args) -> anyhow::Result<()> {
         "{elapsed_precise} [{bar:24}] {pos}/{len} {msg}",
     )?);
     bar.enable_steady_tick(std::time::Duration::from_millis(200));
-    let progress = |done, all, next: &str| {
-        bar.set_length(all as u64);
-        bar.set_position(done as u64);
-        bar.set_message(next.to_owned());
-    };
+    let progress = |done, all, next: &str| show_progress(&bar, done, all, next);
     let (args, tables) = match &what.what {
         What::Tracker(TrackerOptions { options, ablate: true, clips }) => {
             let clips = clips.as_deref();
@@ -131,6 +134,13 @@ pub fn run(what: &Args) -> anyhow::Result<()> {
         bail!("{failures} figures are not what they must be");
     }
     Ok(())
+}
+
+/// Shows on the bar how many of the experiments are done, and which one is next.
+fn show_progress(bar: &ProgressBar, done: usize, all: usize, next: &str) {
+    bar.set_length(all as u64);
+    bar.set_position(done as u64);
+    bar.set_message(next.to_owned());
 }
 
 /// Draws a figure of each table into a folder.

@@ -27,8 +27,11 @@ const LETTER: usize = 7;
 /// twice as much figures of 1 and 2 may lie a hundredth of the axis apart.
 const WIDE: f64 = 50.0;
 
+/// Colour of our figures.
 const OURS: RGBColor = RGBColor(31, 90, 160);
+/// Colour of the paper's figures.
 const PAPER: RGBColor = RGBColor(200, 70, 20);
+/// Colour of a reference implementation's figures.
 const REFERENCE: RGBColor = RGBColor(30, 130, 60);
 
 /// Draws a table into an SVG file.

@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_geometry::Geodetic;
-use crossfix_video::{Pixels, decode_still};
-use crossfix_view::{GroundPicture, Picture, RecordingStream};
+use crossfix_video::{Pixels, Still, decode_still};
+use crossfix_view::{GroundPicture, RecordingStream, SitePicture};
 
+use crate::commands::anchor::AnchorArg;
 use crate::commands::numbers;
 
 /// Longest side of a picture of the ground, pixels: every graphics card takes this as one texture.
@@ -15,19 +16,14 @@ const MOST_SIDE: usize = 8192;
 
 #[derive(Debug, Default, clap::Args)]
 pub struct EarthArgs {
-    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
-    /// ellipsoid. A map is beside the site then; live it is the network file's `[anchor]` without.
-    #[arg(
-        long,
-        value_name = "LAT,LON,HEIGHT",
-        value_parser = numbers::place,
-        allow_hyphen_values = true
-    )]
-    anchor: Option<Geodetic>,
-    /// A picture of the ground from above, north up (PNG or JPEG), to lie under the site.
+    #[command(flatten)]
+    origin: AnchorArg,
+    /// A picture of the ground from above, north up (PNG or JPEG), to be shown under the site. (A
+    /// map of the surroundings is shown whenever --anchor, or live the network file's `[anchor]`,
+    /// says where the site is.)
     #[arg(long, value_name = "FILE", requires = "map_edges")]
     map: Option<PathBuf>,
-    /// Where the picture of the ground ends: degrees north and east of its edges.
+    /// The edges of the picture of the ground, degrees north and east.
     #[arg(
         long,
         value_name = "SOUTH,WEST,NORTH,EAST",
@@ -51,10 +47,11 @@ impl EarthArgs {
             }
             _ => None,
         };
-        let anchor = self.anchor.or(known);
+        let anchor = self.origin.anchor.or(known);
         ensure!(
             anchor.is_some() || ground.is_none(),
-            "where under the picture of the ground is the site? Say where on Earth its origin is, with --anchor"
+            "where under the picture of the ground is the site? \
+             Say where on Earth its origin is, with --anchor"
         );
         Ok(OnEarth(anchor.map(|anchor| (anchor, ground))))
     }
@@ -62,8 +59,8 @@ impl EarthArgs {
 
 impl OnEarth {
     /// A new picture, placed at that position on Earth.
-    pub fn picture(self, stream: RecordingStream) -> anyhow::Result<Picture> {
-        let picture = Picture::new(stream)?;
+    pub fn picture(self, stream: RecordingStream) -> anyhow::Result<SitePicture> {
+        let picture = SitePicture::new(stream)?;
         Ok(match self.0 {
             Some((anchor, ground)) => picture.on_earth(anchor, ground)?,
             None => picture,
@@ -72,7 +69,7 @@ impl OnEarth {
 }
 
 fn ground(path: &Path, [south_west, north_east]: [Geodetic; 2]) -> anyhow::Result<GroundPicture> {
-    let (width, height, pixels) =
+    let Still { width, height, pixels } =
         decode_still(&std::fs::read(path)?).map_err(anyhow::Error::msg)?;
     ensure!(
         width.max(height) <= MOST_SIDE,

@@ -7,8 +7,9 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use crossfix_message::{CameraName, Key, Timestamp};
 use crossfix_transport::{NetworkConfig, Received, Reception, Role, Subscription};
-use crossfix_view::{Picture, RecordingStream};
+use crossfix_view::{RecordingStream, SitePicture};
 
+use crate::commands::examples;
 use crate::config;
 use crate::lookout::Lookout;
 use crate::network;
@@ -22,12 +23,13 @@ pub use earth::EarthArgs;
 
 /// Show a site in Rerun: live, from a recording, or saved to an .rrd file.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    crossfix view recordings/two-uavs.mcap\n  \
-    crossfix view recordings/two-uavs.mcap --save two-uavs.rrd\n  \
-    crossfix view -c configs/site/network.toml\n  \
-    crossfix view today.mcap --anchor 48.3538,11.7861,490 --map site.png \\\n      \
-    --map-edges 48.352,11.783,48.356,11.789")]
+#[command(after_help = examples(&[
+    "crossfix view recordings/two-uavs.mcap",
+    "crossfix view recordings/two-uavs.mcap --save two-uavs.rrd",
+    "crossfix view -c configs/site/network.toml",
+    "crossfix view today.mcap --anchor 48.3538,11.7861,490 --map site.png \\\n\
+     --map-edges 48.352,11.783,48.356,11.789",
+]))]
 pub struct Args {
     /// The recording (MCAP) to show.
     #[arg(required_unless_present = "config", conflicts_with = "config")]
@@ -35,11 +37,11 @@ pub struct Args {
     /// The network's file (TOML): show the site live.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Write the picture to a file (.rrd) instead of a viewer. A live one that is there already
-    /// stays, and the new one is written beside it.
+    /// Write the picture to a file (.rrd) instead of a viewer. An existing file of a live view is
+    /// kept, and the new one gets another name.
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
-    /// A viewer that runs already, e.g. 127.0.0.1:9876; one is started without.
+    /// A viewer that is running already, e.g. 127.0.0.1:9876; without it, one is started.
     #[arg(long, value_name = "ADDRESS", conflicts_with = "save")]
     connect: Option<SocketAddr>,
     #[command(flatten)]
@@ -90,7 +92,7 @@ pub fn save_recording(recording: &Path, rrd: &Path, earth: &EarthArgs) -> anyhow
     draft.keep()
 }
 
-fn draw_recording(mut picture: Picture, recording: &Path) -> anyhow::Result<()> {
+fn draw_recording(mut picture: SitePicture, recording: &Path) -> anyhow::Result<()> {
     let mut lacks = Lacks::default();
     let mut shown = 0_u64;
     recorded::for_each(recording, &mut lacks, |lacks, entry| {
@@ -147,8 +149,8 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
         }
         if looked_at.elapsed() >= LOOK_PERIOD {
             looked_at = Instant::now();
-            lookout.look(looked_at);
-            watch.look(&subscription, looked_at);
+            lookout.check(looked_at);
+            watch.check(&subscription, looked_at);
             picture.clear_silent(Timestamp::from_seconds(wall_seconds()))?;
             is_watched = !picture.has_lost_its_viewer();
         }
@@ -172,7 +174,7 @@ struct ViewerFeed {
 }
 
 impl ViewerFeed {
-    fn show(&mut self, picture: &mut Picture, received: &Received) -> anyhow::Result<()> {
+    fn show(&mut self, picture: &mut SitePicture, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, origin, at } = received;
         if !self.network.names(key) {
             self.repeats.warn("foreign", *at, || {
@@ -206,7 +208,7 @@ impl ViewerFeed {
         Ok(())
     }
 
-    fn look(&mut self, subscription: &Subscription, now: Instant) {
+    fn check(&mut self, subscription: &Subscription, now: Instant) {
         self.repeats.remind(now);
         let dropped = subscription.refused().dropped;
         if dropped > 0 {

@@ -1,5 +1,5 @@
 use super::super::stub::{PASSWORD, Reply, Stub, USER};
-use super::super::{Stream, describe};
+use super::super::{OfferedStream, describe};
 use super::*;
 
 const ANGLE_SD_RAD: f64 = 1e-3;
@@ -53,7 +53,7 @@ fn settled(pointed: Pointed) -> ScanAngles {
 
 #[test]
 fn a_position_is_an_angle_and_back() {
-    let scale = Scale { pan: [3.0, -3.0], tilt: [-0.5, 1.5] };
+    let scale = AngleScale { pan: [3.0, -3.0], tilt: [-0.5, 1.5] };
     let angles = scale.angles([0.5, -0.5]);
     assert!((angles.azimuth + 1.5).abs() < 1e-12 && angles.elevation.abs() < 1e-12);
     let [pan, tilt] = scale.position(angles);
@@ -70,7 +70,7 @@ fn it_has_settled_when_it_has_stood_for_as_long_as_an_image_takes() {
     let at = |tenth: u32| begun + ASKED_EVERY * tenth;
     let mut pointed = Head::new(ANGLE_SD_RAD);
     let hear = |pointed: &mut Head, tenth: u32, azimuth: f64, moves: bool| {
-        pointed.hear(degrees(azimuth, 0.0), moves, at(tenth));
+        pointed.observe(degrees(azimuth, 0.0), moves, at(tenth));
         is_settled(pointed.at(at(tenth)))
     };
     let settled: Vec<bool> = (0..8).map(|k| hear(&mut pointed, k, 10.0, false)).collect();
@@ -173,7 +173,8 @@ fn a_camera_says_its_streams_and_where_it_points() {
     let login = config.login().unwrap();
     let camera = describe(&config.url, login.as_ref()).unwrap();
     assert_eq!(camera.name, "Stub One");
-    let main = Stream { profile: "main".to_owned(), url: "rtsp://127.0.0.1/main".to_owned() };
+    let main =
+        OfferedStream { profile: "main".to_owned(), url: "rtsp://127.0.0.1/main".to_owned() };
     assert_eq!(camera.streams[1], main);
     assert_eq!(camera.position, Some([0.0, 0.0]));
 }

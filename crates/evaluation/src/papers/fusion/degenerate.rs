@@ -8,16 +8,18 @@ use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Table, TableRow, mean, root_mean_square, share};
+use super::super::table::{Limit, SampleStatistic, Table, TableRow, mean, root_mean_square, share};
 use super::site::{LAYOUTS, PERIODS, PaperSite, StraightTarget, line, tangent_noise};
 use super::{REFERENCE_RUNS, VELOCITY_SD, reference_tolerance};
 
 /// Number of runs of a layout for each run of the options. With half of it standard errors are 1.4
 /// times as large.
 const CHEAP: usize = 10;
-/// Standard deviation of the prior on the velocity in the reference's table, m/s.
+/// Standard deviation of the prior on the velocity in the reference's table, m/s. With half of it
+/// the MAP's velocities would have smaller errors than the reference's.
 const PRIOR_SD: f64 = 30.0;
-/// Above this condition number the reference's solver uses the pseudo-inverse.
+/// Above this condition number the reference's solver uses the pseudo-inverse. With half of it the
+/// same: a layout's is below 500 or infinite.
 const WORST_CONDITION: f64 = 1e9;
 /// Condition number above which a matrix counts as singular. The largest finite one of a layout is
 /// 469, and rounding leaves some 1e16 of an infinite one: half of it gives the same.
@@ -62,7 +64,7 @@ const fn unreferenced(condition: f64, degeneracy: Degeneracy) -> KnownFigures {
     KnownFigures { condition, degeneracy, errors: None }
 }
 
-/// Figures of [`LAYOUTS`], in their order.
+/// Figures of [`LAYOUTS`], in their order: the reference implementation's.
 const REFERENCES: [KnownFigures; 8] = [
     reference(20.0, Degeneracy::Regular, [0.27, 2.2], [0.26, 2.1]),
     reference(202.0, Degeneracy::OfPlace, [1.5, 14.7], [1.3, 12.0]),
@@ -74,11 +76,11 @@ const REFERENCES: [KnownFigures; 8] = [
     reference(f64::INFINITY, Degeneracy::OfPlace, [3.6, 117.0], [0.41, 11.0]),
 ];
 
-/// Names of the solvers.
+/// Names of the solvers, in the order of [`answers`].
 const SOLVERS: [&str; 3] = ["papers' inverse", "rank against the noise", "map, 30 m/s prior"];
 
 /// A solver's answer for one period.
-struct Answer {
+struct SolvedState {
     position: Point3<f64>,
     velocity: Vector3<f64>,
     /// Time of that position.
@@ -88,7 +90,7 @@ struct Answer {
 
 /// Klochko 2020 to the letter (eqs. 10 and 11): the inverse, or the minimum-norm solution where the
 /// condition number exceeds [`WORST_CONDITION`], and the range refined from the pair.
-fn papers_inverse(lines: &[TimedLine; 3]) -> Option<Answer> {
+fn papers_inverse(lines: &[TimedLine; 3]) -> Option<SolvedState> {
     let [first, second, third] = lines;
     let mut a = Matrix6::zeros();
     let mut b = Vector6::zeros();
@@ -109,19 +111,19 @@ fn papers_inverse(lines: &[TimedLine; 3]) -> Option<Answer> {
     let velocity: Vector3<f64> = x.fixed_rows::<3>(3).into_owned();
     let dt = second.time.seconds_since(first.time);
     let position = pair(first, second, velocity * dt)?.position;
-    Some(Answer { position, velocity, time: first.time, observability: None })
+    Some(SolvedState { position, velocity, time: first.time, observability: None })
 }
 
 /// The answers of [`SOLVERS`] in their order.
-fn answers(lines: &[TimedLine; 3]) -> [Option<Answer>; 3] {
+fn answers(lines: &[TimedLine; 3]) -> [Option<SolvedState>; 3] {
     let [first, second, third] = lines;
-    let ours = triple([first, second, third], VELOCITY_SD).map(|solution| Answer {
+    let ours = triple([first, second, third], VELOCITY_SD).map(|solution| SolvedState {
         position: solution.position,
         velocity: solution.velocity,
         time: first.time,
         observability: Some(solution.observability),
     });
-    let posterior = map(lines, first.time, PRIOR_SD).map(|solution| Answer {
+    let posterior = map(lines, first.time, PRIOR_SD).map(|solution| SolvedState {
         position: solution.state.position(),
         velocity: solution.state.velocity(),
         time: first.time,
@@ -154,6 +156,19 @@ struct SolverOutcome {
     rank_is_true: bool,
 }
 
+impl SolverOutcome {
+    fn of(answer: &SolvedState, target: &StraightTarget, rank_is_true: bool) -> Self {
+        Self {
+            errors: [
+                (answer.position - target.at(answer.time.seconds())).norm(),
+                (answer.velocity - target.velocity).norm(),
+            ],
+            observability: answer.observability,
+            rank_is_true,
+        }
+    }
+}
+
 fn run(layout: &PaperSite, noise: &mut Noise) -> [Option<SolverOutcome>; 3] {
     let target = StraightTarget::random(noise);
     let (Some(noisy), Some(exact)) =
@@ -161,19 +176,13 @@ fn run(layout: &PaperSite, noise: &mut Noise) -> [Option<SolverOutcome>; 3] {
     else {
         return [None; 3];
     };
-    let rank = |answer: &Option<Answer>| answer.as_ref().and_then(|a| Some(a.observability?.rank));
+    let rank =
+        |answer: &Option<SolvedState>| answer.as_ref().and_then(|a| Some(a.observability?.rank));
     let ranks = answers(&exact).map(|answer| rank(&answer));
     let mut outcomes = [None; 3];
     for ((outcome, answer), true_rank) in outcomes.iter_mut().zip(answers(&noisy)).zip(ranks) {
         let rank_is_true = rank(&answer) == true_rank;
-        *outcome = answer.map(|answer| SolverOutcome {
-            errors: [
-                (answer.position - target.at(answer.time.seconds())).norm(),
-                (answer.velocity - target.velocity).norm(),
-            ],
-            observability: answer.observability,
-            rank_is_true,
-        });
+        *outcome = answer.map(|answer| SolverOutcome::of(&answer, &target, rank_is_true));
     }
     outcomes
 }
@@ -191,8 +200,8 @@ fn said(
     }
     let weak: Vec<WeakAxis> = of_solver.iter().filter_map(|o| o.weak_axis).collect();
     let row = |what: &str, figure| TableRow::new(format!("{series}: {what}"), at, figure);
-    let mut say_so = row("share that say so", share(of_solver.iter().map(|o| !o.is_full())));
-    say_so.limit = match degeneracy {
+    let mut degenerate = row("share that say so", share(of_solver.iter().map(|o| !o.is_full())));
+    degenerate.limit = match degeneracy {
         Degeneracy::Regular => Some(Limit::AtMost(0.01)),
         Degeneracy::OfPlace => None,
         Degeneracy::OfTimes => Some(Limit::AtLeast(0.99)),
@@ -200,7 +209,7 @@ fn said(
     // Noise must not make a singular system look regular.
     let truly = share(outcomes.iter().map(|o| o.rank_is_true));
     let truly = row("rank is that without noise", truly).limit(Limit::AtLeast(0.95));
-    let mut rows = vec![say_so, truly];
+    let mut rows = vec![degenerate, truly];
     if !weak.is_empty() {
         let velocity = share(weak.iter().map(|axis| axis.quantity == Quantity::Velocity));
         rows.push(row("of these, of a velocity", velocity));
@@ -246,8 +255,12 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                 let mut row = TableRow::new(&series, at, figure);
                 if let Some(value) = expected.map(|expected| expected[quantity]) {
                     let digit = [0.01, 1.0][quantity];
-                    let tolerance =
-                        reference_tolerance(figure.1, errors.len(), REFERENCE_RUNS, digit);
+                    let tolerance = reference_tolerance(
+                        figure.standard_error,
+                        errors.len(),
+                        REFERENCE_RUNS,
+                        digit,
+                    );
                     row = row.reference(value);
                     row.limit = asked(solver, reference.degeneracy, value, tolerance);
                 }
@@ -276,7 +289,7 @@ fn condition_row(layout: &PaperSite, reference: &KnownFigures, at: f64) -> Table
     let solution =
         exact.and_then(|[first, second, third]| triple([&first, &second, &third], VELOCITY_SD));
     let condition = solution.map_or(f64::NAN, |s| s.observability.condition_number);
-    let row = TableRow::new(layout.name, at, (condition, 0.0));
+    let row = TableRow::new(layout.name, at, SampleStatistic::exact(condition));
     if reference.condition > SINGULAR {
         return row.limit(Limit::AtLeast(SINGULAR));
     }

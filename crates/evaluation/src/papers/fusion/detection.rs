@@ -14,16 +14,18 @@ use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Table, TableRow, deviation, mean, share};
+use super::super::table::{Limit, SampleStatistic, Table, TableRow, deviation, mean, share};
 use super::site::{PERIODS, PaperSite, StraightTarget, line, tangent_noise};
 use super::{REFERENCE_RUNS, reference_tolerance};
 
 /// Number of runs of a cell for each run of the options: a run takes a tenth of a millisecond. With
 /// half of it standard errors are 1.4 times as large.
 const CHEAP: usize = 10;
-/// A target is found if a group ends within this distance of it, m.
+/// A target is found if a group ends within this distance of it, m: the reference implementation's.
+/// With half of it more targets of two receivers would count as missed.
 const MATCH_GATE: f64 = 4.1;
-/// Noise of each coordinate of M(i, j), m.
+/// Noise of each coordinate of the fixes M(i, j), m (Klochko 2020). With half of it
+/// three receivers would have half of the paper's error.
 const POSITION_SD: f64 = 0.1;
 /// The spatial gate of two receivers, m^2: `J <= beta`, Klochko 2020, eq. 9. The lines of a true
 /// pair miss each other by what the target moves in the delay, up to 3.9 m SD, and the algorithm
@@ -32,7 +34,7 @@ const POSITION_SD: f64 = 0.1;
 const PAIR_GATE: f64 = 4.0 * 3.9 * 4.0 * 3.9;
 
 /// Velocity scale for deciding the rank, m/s: the paper has no prior on velocities. With 15.6, as
-/// the targets have, half a per cent of exact periods would pass for degenerate.
+/// the targets have, half a per cent of exact periods would count as degenerate.
 const VELOCITY_SCALE: f64 = 100.0;
 
 /// What the paper's noise is added to.
@@ -55,7 +57,7 @@ impl NoiseInterpretation {
 
     fn name(self) -> &'static str {
         match self {
-            Self::Positions => "noise on M",
+            Self::Positions => "noise on positions",
             Self::Bearings => "noise on bearings",
         }
     }
@@ -70,7 +72,7 @@ struct TableColumn {
     targets: usize,
     delays: [f64; 3],
     paper: DetectionFigures,
-    /// The reference implementation's figures, by reading.
+    /// The reference implementation's figures, by interpretation.
     reference: [DetectionFigures; 2],
 }
 
@@ -88,6 +90,7 @@ const fn cell(
     TableColumn { receivers, targets, delays, paper, reference: [on_positions, on_bearings] }
 }
 
+/// The columns of tables 1 and 2, with the paper's figures and the reference implementation's.
 const CELLS: [TableColumn; 8] = [
     cell(1, &[0.1], [1.25, 0.89, 1.00], [1.32, 1.01, 0.98], [1.37, 1.02, 0.98]),
     cell(1, &[0.25], [3.10, 2.30, 0.71], [3.20, 2.46, 0.69], [3.35, 2.50, 0.65]),
@@ -177,7 +180,7 @@ fn period_fix(
 
 fn run(
     cell: &TableColumn,
-    reading: NoiseInterpretation,
+    interpretation: NoiseInterpretation,
     cameras: &[(CameraName, Camera)],
     noise: &mut Noise,
 ) -> DetectionRun {
@@ -186,26 +189,19 @@ fn run(
     let mut grouping = Grouping::new(GroupingRules {
         periods: PERIODS,
         fixes: PERIODS,
-        gate: TemporalGate::Distance(reading.gate()),
+        gate: TemporalGate::Distance(interpretation.gate()),
         max_speed: f64::INFINITY,
         shared_lines: 0,
     });
     let mut groups = Vec::new();
     for period in 0..PERIODS {
-        let seen = cameras.iter().zip(cell.delays).map(|((name, camera), delay)| {
-            let time = period as f64 + delay;
-            let lines = targets.iter().enumerate().filter_map(|(index, target)| {
-                let offset = tangent_noise(
-                    (reading == NoiseInterpretation::Bearings).then_some(&mut *noise),
-                );
-                let id = (name.clone(), period as u64, index);
-                Some((id, line(camera, target.at(time), offset, time)?))
-            });
-            lines.collect()
+        let seen = cameras.iter().zip(cell.delays).map(|(camera, delay)| {
+            let noise = (interpretation == NoiseInterpretation::Bearings).then_some(&mut *noise);
+            lines_of(camera, &targets, period, delay, noise)
         });
         let lines: Vec<Vec<(LineId, TimedLine)>> = seen.collect();
         let mut fixes = fixes(&lines);
-        if reading == NoiseInterpretation::Positions {
+        if interpretation == NoiseInterpretation::Positions {
             for fix in &mut fixes {
                 for axis in 0..3 {
                     fix.fix.state.mean[axis] += POSITION_SD * noise.normal();
@@ -225,6 +221,23 @@ fn run(
         counted: grouping.target_count() == targets.len(),
         distances,
     }
+}
+
+/// A camera's sight lines to all targets in a period, at its delay, with noise if there is any.
+fn lines_of(
+    (name, camera): &(CameraName, Camera),
+    targets: &[StraightTarget],
+    period: usize,
+    delay: f64,
+    mut noise: Option<&mut Noise>,
+) -> Vec<(LineId, TimedLine)> {
+    let time = period as f64 + delay;
+    let lines = targets.iter().enumerate().filter_map(|(index, target)| {
+        let offset = tangent_noise(noise.as_deref_mut());
+        let id = LineId { camera: name.clone(), sequence: period as u64, index };
+        Some((id, line(camera, target.at(time), offset, time)?))
+    });
+    lines.collect()
 }
 
 /// The distances of targets from ends, each end for one target, in the pairing of least total
@@ -247,28 +260,34 @@ fn matched(places: &[Point3<f64>], ends: &[Point3<f64>]) -> Vec<f64> {
     }
 }
 
+/// A figure, and the number of samples behind it.
+struct SampledFigure {
+    figure: SampleStatistic,
+    samples: usize,
+}
+
 /// Mean distance, SD and probability of a cell, and the share of runs whose number of targets is
-/// right, each with its standard error and number of samples.
+/// right.
 fn figures(
     options: ValidationOptions,
     cell: &TableColumn,
-    reading: NoiseInterpretation,
-) -> [((f64, f64), usize); 4] {
+    interpretation: NoiseInterpretation,
+) -> [SampledFigure; 4] {
     let layout = PaperSite::orthogonal("", cell.delays);
     let cameras = layout.cameras().unwrap_or_default();
     let names = ["first", "second", "third"].into_iter().filter_map(|name| name.parse().ok());
     let cameras: Vec<(CameraName, Camera)> = names.zip(cameras).take(cell.receivers).collect();
     let runs = runs::all(CHEAP * options.runs, |index| {
-        run(cell, reading, &cameras, &mut Noise::new(options.seed, index))
+        run(cell, interpretation, &cameras, &mut Noise::new(options.seed, index))
     });
     let distances: Vec<f64> = runs.iter().flat_map(|run| run.distances.iter().copied()).collect();
     let found = share(runs.iter().map(|run| run.all));
     let counted = share(runs.iter().map(|run| run.counted));
     [
-        (mean(&distances), distances.len()),
-        (deviation(&distances), distances.len()),
-        (found, runs.len()),
-        (counted, runs.len()),
+        SampledFigure { figure: mean(&distances), samples: distances.len() },
+        SampledFigure { figure: deviation(&distances), samples: distances.len() },
+        SampledFigure { figure: found, samples: runs.len() },
+        SampledFigure { figure: counted, samples: runs.len() },
     ]
 }
 
@@ -284,21 +303,23 @@ fn probability_tolerance(reference: f64, standard_error: f64) -> f64 {
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let mut rows: [Vec<TableRow>; 4] = Default::default();
     for cell in &CELLS {
-        for reading in [NoiseInterpretation::Positions, NoiseInterpretation::Bearings] {
+        for interpretation in [NoiseInterpretation::Positions, NoiseInterpretation::Bearings] {
             let receivers = if cell.receivers == 2 { "two" } else { "three" };
-            let series = format!("{receivers} receivers, m = {}, {}", cell.targets, reading.name());
-            let reference = cell.reference[reading as usize];
-            for (quantity, (figure, samples)) in
-                figures(options, cell, reading).into_iter().enumerate()
+            let series =
+                format!("{receivers} receivers, m = {}, {}", cell.targets, interpretation.name());
+            let reference = cell.reference[interpretation as usize];
+            for (quantity, SampledFigure { figure, samples }) in
+                figures(options, cell, interpretation).into_iter().enumerate()
             {
                 let Some(&value) = reference.get(quantity) else {
                     rows[quantity].push(TableRow::new(&series, cell.delays[1], figure));
                     continue;
                 };
                 let tolerance = if quantity == 2 {
-                    probability_tolerance(value, figure.1)
+                    probability_tolerance(value, figure.standard_error)
                 } else {
-                    reference_tolerance(figure.1, samples, REFERENCE_RUNS * cell.targets, 0.01)
+                    let of_reference = REFERENCE_RUNS * cell.targets;
+                    reference_tolerance(figure.standard_error, samples, of_reference, 0.01)
                 };
                 rows[quantity].push(
                     TableRow::new(&series, cell.delays[1], figure)

@@ -11,11 +11,13 @@ use crossfix_message::{
 };
 use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
-use crate::bound::{BearingNoise, FisherInformation, LineGeometry};
+use crate::bound::{BearingInformation, FisherInformation, LineGeometry};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Table, TableRow, mean, root_mean_square, root_ratio, share};
+use super::super::table::{
+    Limit, SampleStatistic, Table, TableRow, mean, root_mean_square, root_ratio, share,
+};
 use super::site::{
     BEARING_SD, LAYOUTS, PERIODS, PaperSite, StraightTarget, bearing, line, tangent_noise,
 };
@@ -28,25 +30,22 @@ const HONEST: Limit = Limit::Near { value: 6.0, tolerance: 0.15 };
 /// With half of it the fusion's gate would refuse many targets, whose velocities have 15.6 m/s, as
 /// too fast.
 const PRIOR_SD: f64 = 15.0;
-/// An error has diverged if it is more than this many of its own standard deviations, or this many
-/// metres. With half of either the same: an honest error on one axis exceeds five deviations once
-/// in 1.7 million runs.
+/// An error has diverged if it is more than this many of its own standard deviations. With half of
+/// it the same: an honest error on one axis exceeds five deviations once in 1.7 million runs.
 const DIVERGED_SDS: f64 = 10.0;
+/// An error has diverged if it is more than this, m: two thirds of the cameras' distance. With half
+/// of it the same.
 const DIVERGED_M: f64 = 100.0;
 
 /// The Cramer-Rao bound at the truth: the least covariance of position and velocity at a time that
 /// any unbiased estimator can have from bearings of a target. `None` if they do not determine all
 /// six numbers.
-fn bound(
-    lines: &[TimedLine],
-    target: &StraightTarget,
-    reference: Timestamp,
-) -> Option<Matrix6<f64>> {
+fn bound(lines: &[TimedLine], target: &StraightTarget, at: Timestamp) -> Option<Matrix6<f64>> {
     let mut information = FisherInformation::default();
-    let noise = BearingNoise::isotropic(BEARING_SD)?;
+    let noise = BearingInformation::isotropic(BEARING_SD)?;
     for TimedLine { line, time, .. } in lines {
         let geometry = LineGeometry::between(line.origin, target.at(time.seconds()))?;
-        information.add(&geometry, &noise, time.seconds_since(reference));
+        information.add(&geometry, &noise, time.seconds_since(at));
     }
     information.covariance()
 }
@@ -214,12 +213,17 @@ impl Rows {
             let errors: Vec<f64> = known.iter().map(|o| o.errors[index]).collect();
             let bounds: Vec<f64> = known.iter().map(|o| o.bound[index]).collect();
             // The root of the bound's mean trace over the runs.
-            let best = mean(&bounds).0.sqrt();
-            let (rms, standard_error) = root_mean_square(&errors);
+            let best = mean(&bounds).value.sqrt();
+            let rms = root_mean_square(&errors);
             let series = format!("{}: {quantity}", layout.name);
-            self.errors.push(TableRow::new(&series, at, (rms, standard_error)));
-            self.errors.push(TableRow::new(format!("{series}, bound"), at, (best, 0.0)));
-            let ratio = TableRow::new(series, at, (rms / best, standard_error / best));
+            self.errors.push(TableRow::new(&series, at, rms));
+            let exact = SampleStatistic::exact(best);
+            self.errors.push(TableRow::new(format!("{series}, bound"), at, exact));
+            let over_bound = SampleStatistic {
+                value: rms.value / best,
+                standard_error: rms.standard_error / best,
+            };
+            let ratio = TableRow::new(series, at, over_bound);
             self.ratios.push(ratio.limit(Limit::AtMost(1.1)));
         }
         let nees: Vec<f64> = known.iter().map(|o| o.nees).collect();
@@ -231,7 +235,8 @@ fn table(name: &'static str, title: &str, y: &'static str, rows: Vec<TableRow>) 
     Table { name, title: title.to_owned(), x: "layout", y, rows }
 }
 
-/// The two layouts in which the paper's own system of equations is regular.
+/// The two layouts in which the paper's own system of equations is regular: those of [`LAYOUTS`]
+/// with its two pairs of delays.
 const REGULAR: [PaperSite; 2] = [
     PaperSite::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
     PaperSite::orthogonal("orthogonal, 0.3/0.4", [0.0, 0.3, 0.4]),
@@ -273,11 +278,11 @@ fn batch(flight: &LimitRun, cameras: &[(CameraName, Camera)]) -> Option<Kinemati
 /// Number of runs of a layout that diverged: none may.
 fn diverged(layout: &PaperSite, at: f64, outcomes: &[Option<EstimateError>]) -> TableRow {
     let count = outcomes.iter().flatten().filter(|outcome| outcome.diverged).count();
-    TableRow::new(layout.name, at, (count as f64, 0.0)).limit(Limit::AtMost(0.0))
+    TableRow::new(layout.name, at, SampleStatistic::exact(count as f64)).limit(Limit::AtMost(0.0))
 }
 
-/// Share of a layout's runs in which the estimator had an answer: a fusion centre that is not told
-/// how fast targets are may take a few in a thousand for too fast.
+/// Share of a layout's runs in which the estimator had an answer: a fusion centre that does not
+/// know how fast targets are may refuse a few in a thousand as too fast.
 fn confirmed(layout: &PaperSite, at: f64, outcomes: &[Option<EstimateError>]) -> TableRow {
     TableRow::new(layout.name, at, share(outcomes.iter().map(Option::is_some)))
         .limit(Limit::AtLeast(0.99))

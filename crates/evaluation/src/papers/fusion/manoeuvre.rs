@@ -4,7 +4,7 @@
 //! prints no number. Here: points uniform in a box of 100 x 100 x 50 m, each at least 40 m from the
 //! one before, flown at 5 m/s on straight lines with a position measured every second, so that a
 //! leg has 8 to 30 frames and a turn takes no time. A filter's parameters are tuned for each noise,
-//! on other flights than those that it is judged on.
+//! on other flights than those that its errors are computed on.
 
 use crossfix_filter::{
     Imm, KinematicState, ModeRates, MotionModel, MotionModels, NormalisedInnovation,
@@ -14,9 +14,12 @@ use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Table, TableRow, mean, root_mean_square, root_ratio, share};
+use super::super::table::{
+    Limit, SampleStatistic, Table, TableRow, mean, root_mean_square, root_ratio, share,
+};
 
-/// Time between measurements, s (Kalinov 2019: T = 1).
+/// Time between measurements, s (Kalinov 2019: T = 1). With half of it a turn has twice as many
+/// measurements as in the paper.
 const STEP: f64 = 1.0;
 /// Speed, m/s. With half of it turns change the velocity by half as much, and the filters differ
 /// less.
@@ -24,23 +27,24 @@ const SPEED: f64 = 5.0;
 /// Number of control points of a flight. With half of it a flight has four turns instead of ten,
 /// and the shares of turns seen scatter more.
 const POINTS: usize = 12;
-/// Frames in which every filter settles from its start; they are not judged. With half of it errors
-/// with a velocity by two to four measurements would be judged too.
+/// Frames in which every filter settles from its start; they are not counted. With half of it
+/// errors with a velocity by two to four measurements would be counted too.
 const SETTLING: usize = 5;
 /// Standard deviation of each component of the state at the start and after an alarm: `P = 1e5 I`
-/// (Kalinov 2019, eqs. 5 and 8).
+/// (Kalinov 2019, eqs. 5 and 8). With half of it nearly the same: both are far above a flight.
 const IGNORANCE: f64 = 316.227_766_016_837_9;
-/// The paper's threshold, in standard deviations of a measurement.
+/// The paper's threshold, in standard deviations of a measurement. With half of it noise alone
+/// would make more alarms.
 const SCALE: f64 = 0.81;
 /// Process noise of the filter without a model of manoeuvres, m^2/s^3: 0.01 m/s in a second. With
 /// half of it the same: both are far below what a turn takes.
 const LOW_DENSITY: f64 = 1e-4;
-/// Number of flights that the filters are tuned on, and the seed that makes these differ from the
-/// judged ones. With half of the flights chance decides more often between neighbouring parameters;
-/// with twice as many, tuning takes twice as long.
+/// Number of flights that the filters are tuned on. With half of it chance decides more often
+/// between neighbouring parameters; with twice as many, tuning takes twice as long.
 const TUNING_RUNS: usize = 30;
+/// Makes the flights for tuning differ from the others: any number does.
 const TUNING_SEED: u64 = 0x7455_6e49;
-/// Standard deviations of the measurements, m: the simulated flight and the real one.
+/// Standard deviations of the measurements, m: the paper's simulated flight and its real one.
 const DEVIATIONS: [f64; 2] = [0.1, 5.0];
 
 /// A flight: its places in each frame, and the frames after which it has turned.
@@ -100,9 +104,9 @@ enum FilterChoice {
 
 /// Result of a method on a flight.
 struct FilterResult {
-    /// Squared errors per axis, m^2, means over the judged frames.
+    /// Squared errors per axis, m^2, means over the counted frames.
     squares: [f64; 3],
-    /// Of each turn, as of [`delays`].
+    /// Of each turn, see [`delays`].
     delays: Vec<Option<f64>>,
 }
 
@@ -119,14 +123,19 @@ impl FilterChoice {
             Self::Smoothed(window) => by_smoothed_residual(flight, deviation, *window),
         };
         let mut squares = [0.0; 3];
-        let judged = places.iter().zip(&flight.places).skip(SETTLING);
-        let count = judged.len() as f64;
-        for (found, truth) in judged {
+        let settled = places.iter().zip(&flight.places).skip(SETTLING);
+        let count = settled.len() as f64;
+        for (found, truth) in settled {
             for (axis, square) in squares.iter_mut().enumerate() {
                 *square += (found[axis] - truth[axis]).powi(2) / count;
             }
         }
         FilterResult { squares, delays: delays(flight, &alarms) }
+    }
+
+    /// Sum of its squared errors on some flights, m^2.
+    fn cost(&self, flights: &[TurningFlight], deviation: f64) -> f64 {
+        flights.iter().flat_map(|flight| self.follow(flight, deviation).squares).sum()
     }
 
     fn name(&self) -> String {
@@ -187,7 +196,7 @@ fn by_smoothed_residual(
         update(&mut state, *z, &spread);
         if alarm {
             alarms.push(frame);
-            // In place of the updated covariance (Kalinov 2019, eqs. 8 and 9).
+            // In place of the posterior covariance (Kalinov 2019, eqs. 8 and 9).
             state.reinitialise(IGNORANCE, IGNORANCE);
         }
         places.push(state.position());
@@ -213,8 +222,8 @@ fn nis(state: &KinematicState, measured: Point3<f64>, spread: &Matrix3<f64>) -> 
 }
 
 fn update(state: &mut KinematicState, measured: Point3<f64>, spread: &Matrix3<f64>) {
-    if let Some((updated, _)) = state.position_updated(measured, spread) {
-        *state = updated;
+    if let Some((posterior, _)) = state.position_updated(measured, spread) {
+        *state = posterior;
     }
 }
 
@@ -223,10 +232,8 @@ fn tuned(deviation: f64, seed: u64, methods: Vec<FilterChoice>) -> FilterChoice 
     let flights: Vec<TurningFlight> = (0..TUNING_RUNS)
         .map(|run| TurningFlight::new(deviation, &mut Noise::new(seed ^ TUNING_SEED, run)))
         .collect();
-    let cost = |method: &FilterChoice| -> f64 {
-        flights.iter().flat_map(|flight| method.follow(flight, deviation).squares).sum()
-    };
-    let costs: Vec<f64> = runs::all(methods.len(), |index| cost(&methods[index]));
+    let costs: Vec<f64> =
+        runs::all(methods.len(), |index| methods[index].cost(&flights, deviation));
     let best = methods.into_iter().zip(costs).min_by(|a, b| a.1.total_cmp(&b.1));
     best.map_or(FilterChoice::Measurement, |(method, _)| method)
 }
@@ -260,10 +267,13 @@ fn methods(deviation: f64, seed: u64) -> Vec<FilterChoice> {
     ]
 }
 
-/// Indices of some methods in [`methods`].
+/// Index in [`methods`] of the Kalman filter without a model of manoeuvres.
 const LOW: usize = 1;
+/// Index in [`methods`] of the tuned Kalman filter.
 const TUNED: usize = 2;
+/// Index in [`methods`] of the Kalman filter with the test of its innovations.
 const NIS: usize = 6;
+/// Index in [`methods`] of the interacting models.
 const MODELS: usize = 7;
 
 /// The reference's RMS errors on x of the methods in their order, at both noises, on flights that
@@ -312,7 +322,7 @@ impl NoiseCase {
         Self { number, methods, results }
     }
 
-    fn row(&self, series: String, figure: (f64, f64)) -> TableRow {
+    fn row(&self, series: String, figure: SampleStatistic) -> TableRow {
         TableRow::new(series, DEVIATIONS[self.number], figure)
     }
 
@@ -362,7 +372,7 @@ impl NoiseCase {
     }
 
     /// Ratio of two methods' RMS errors over all axes.
-    fn ratio(&self, one: usize, other: usize) -> (f64, f64) {
+    fn ratio(&self, one: usize, other: usize) -> SampleStatistic {
         root_ratio(&self.squares(one), &self.squares(other))
     }
 

@@ -8,11 +8,14 @@ mod site;
 
 use super::Experiment;
 
-/// Standard deviation of each component of the targets' velocities, m/s.
+/// Standard deviation of each component of the targets' velocities, m/s: the reference
+/// implementation's. With half of it true pairs miss each other by half as much.
 const VELOCITY_SD: f64 = 15.6;
-/// Number of runs of the reference implementation behind each of its figures.
+/// Number of runs of the reference implementation behind each of its figures. With half of it the
+/// tolerances of the comparison would be wider.
 const REFERENCE_RUNS: usize = 300;
 
+/// The fusion's experiments, in the order of their tables.
 pub(super) const EXPERIMENTS: [Experiment; 6] = [
     Experiment { name: "detection (Klochko 2020, tables 1 and 2)", make: detection::tables },
     Experiment { name: "degenerate geometries, one period", make: degenerate::tables },

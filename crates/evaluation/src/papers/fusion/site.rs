@@ -10,15 +10,18 @@ use nalgebra::{Matrix2, Point3, Unit, Vector2, Vector3};
 use super::super::runs::Noise;
 use super::VELOCITY_SD;
 
-/// Distance of the cameras from the origin, m.
+/// Distance of the cameras from the origin, m. With half of it and
+/// the same [`BEARING_SD`] errors would be half as large.
 const RANGE: f64 = 150.0;
-/// Standard deviation of a bearing on each tangent, rad: 0.1 m at that distance.
+/// Standard deviation of a bearing on each tangent, rad: 0.1 m at that distance (Klochko 2020).
+/// With half of it errors would be half as large as the paper's.
 pub(super) const BEARING_SD: f64 = 0.1 / RANGE;
-/// Observation periods, of 1 s each.
+/// Observation periods, of 1 s each: the paper's. With half of it a group would rest on two or
+/// three fixes.
 pub(super) const PERIODS: usize = 5;
 
 /// Elevation of the lines of sight at which three of them, 120 degrees apart, are perpendicular,
-/// deg.
+/// deg: `atan(1 / sqrt(2))`.
 const ORTHOGONAL: f64 = 35.264_389_682_754_654;
 
 /// Three cameras round the origin, and their delays within each period.

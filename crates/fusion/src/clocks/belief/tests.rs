@@ -1,4 +1,5 @@
 use super::*;
+use crate::clocks::ClockEstimate;
 
 fn name(text: &str) -> CameraName {
     text.parse().unwrap()

@@ -2,7 +2,7 @@ use crossfix_geometry::{SightLine, tangent_basis};
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix2, Point3, Unit, Vector2, Vector3};
 
-use super::super::window::{Role, StampedLine};
+use super::super::window::{ClockRole, StampedLine};
 use super::*;
 use crate::track::TrackId;
 use crate::uncertainty::CorrelatedNoise;
@@ -47,7 +47,7 @@ fn after(
         let place = Vector3::from(place(t).coords);
         window.add(
             &name(camera),
-            Role::Estimated,
+            ClockRole::Estimated,
             StampedLine { time: stamped, line, lasting: CorrelatedNoise::NONE, white: 1.0 },
             place,
         );

@@ -14,17 +14,17 @@ mod seen;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
-use crossfix_message::{CameraName, Cued, Timestamp};
+use crossfix_filter::KinematicState;
+use crossfix_message::{CameraName, Timestamp};
 
 use self::reading::{Reading, ReadingContext, Rules, TOGETHER_S};
-use self::seen::{SeenDirection, TURNING_DENSITY, pose_variance};
-use super::one_target::OneTargetTest;
-use super::{Start, lines_with_pose};
+use self::seen::{SeenDirection, pose_variance};
+use super::{NewTrack, lines_with_pose};
 use crate::cameras::{KnownCamera, Rooted};
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
-use crate::spatial::TimedLine;
-use crate::track::{Track, TrackStatus};
+use crate::spatial::{LineId, TimedLine};
+use crate::track::{FusedTrack, TrackStatus};
 use crate::tracker::{UsedSighting, same_target};
 use crate::{Exposure, FusionConfig};
 
@@ -55,6 +55,7 @@ struct HandoverBounds {
     tried: usize,
 }
 
+/// See there, also for what breaks with half of each.
 const BOUNDS: HandoverBounds = HandoverBounds { seen: 20, lost: 20, readings: 4, tried: 50 };
 
 /// The directions that each camera follows alone, and their readings.
@@ -90,23 +91,11 @@ impl Handover {
     pub(super) fn known(&self, now: Timestamp) -> Vec<CueTarget> {
         // Geometric mean: the middle of ln r.
         let range = (NEAREST_M * self.rules.max_range_m).sqrt();
-        let sure = self.seen.iter().flat_map(|(camera, seen)| {
-            let open = |one: &&SeenDirection| {
-                one.is_sure(&self.rules.tracking) && !one.is_lost(now, &self.rules.tracking)
-            };
-            seen.iter().filter(open).map(move |one| (camera, one))
-        });
-        let known = sure.filter_map(|(camera, one)| {
-            let state = one.state_at(range, self.rules.speed)?;
-            let of =
-                Cued { track_id: 0, camera: camera.to_string(), image_track_id: one.image_track };
-            let seen_from = Some(one.line.line.origin);
-            Some(CueTarget::new(of, now, seen_from, |time| {
-                let ahead_s = time.seconds_since(one.sight.time);
-                state.predicted(ahead_s, TURNING_DENSITY * range.powi(2))
-            }))
-        });
-        known.collect()
+        let Rules { tracking, speed, .. } = &self.rules;
+        let all =
+            self.seen.iter().flat_map(|(camera, seen)| seen.iter().map(move |one| (camera, one)));
+        let sure = all.filter(|(_, one)| one.is_sure(tracking) && !one.is_lost(now, tracking));
+        sure.filter_map(|(camera, one)| one.cue_target(camera, now, range, *speed)).collect()
     }
 
     /// Handles an exposure, given which of its lines (by index) belong to tracks; returns the
@@ -117,7 +106,7 @@ impl Handover {
         used: &[UsedSighting],
         known: &KnownCamera,
         motion: &MotionSetup,
-    ) -> Vec<Start> {
+    ) -> Vec<NewTrack> {
         let mut is_owned = vec![false; exposure.sightings.len()];
         used.iter().for_each(|used| is_owned[used.index] = true);
         let context = ReadingContext { exposure, known, motion, is_owned: &is_owned };
@@ -131,23 +120,15 @@ impl Handover {
     /// Forgets directions that have been silent for as long as a track would be kept, and at once
     /// those that were lost before they were sure.
     fn forget(&mut self, now: Timestamp) {
-        let (tracking, pair_s) = (&self.rules.tracking, self.rules.pair_s);
-        let lost_after_s = tracking.lost_after_s;
+        let lost_after_s = self.rules.tracking.lost_after_s;
         for seen in self.seen.values_mut() {
             for one in seen.iter_mut() {
                 one.readings.retain(|reading| {
-                    now.seconds_since(reading.track.updated) <= lost_after_s
+                    now.seconds_since(reading.track.updated_at) <= lost_after_s
                         && reading.ratio() > GIVEN_UP
                 });
             }
-            seen.retain(|one| {
-                let silent_s = now.seconds_since(one.sight.time);
-                if one.is_sure(tracking) {
-                    silent_s <= lost_after_s || !one.readings.is_empty()
-                } else {
-                    silent_s <= pair_s || !one.is_lost(now, tracking)
-                }
-            });
+            seen.retain(|one| one.is_worth_keeping(now, &self.rules));
         }
     }
 
@@ -222,7 +203,7 @@ impl Handover {
     /// Starts readings: combines what other cameras have lost sight of with what this camera has
     /// begun to see since.
     fn cross(&mut self, context: &ReadingContext<'_>, begun: &[ContinuedLine]) {
-        let ReadingContext { exposure, known, motion, is_owned } = *context;
+        let ReadingContext { exposure, is_owned, .. } = *context;
         let now = exposure.time;
         let others = self.seen.iter_mut().filter(|(camera, _)| **camera != exposure.camera);
         let lost = others.flat_map(|(camera, seen)| seen.iter_mut().map(move |one| (camera, one)));
@@ -240,43 +221,22 @@ impl Handover {
                 begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
             for &ContinuedLine { index, number, .. } in since.filter(|other| !is_owned[other.index])
             {
-                let name = (exposure.camera.clone(), exposure.sequence, index);
+                let name = LineId::new(exposure, index);
                 let is_read = one.readings.iter().any(|reading| reading.newest == name);
                 let is_full =
                     one.readings.len() >= BOUNDS.readings || one.tried.len() >= BOUNDS.tried;
                 if is_read || is_full || !one.tried.insert(number) {
                     continue;
                 }
-                let line = &exposure.sightings[index].line;
-                let reading =
-                    one.placed(camera, line, now, &self.rules, motion).and_then(|track| {
-                        // Price of the velocity that the reading implies: v^2 / (2 sd^2), of a
-                        // prior about zero.
-                        let unlikely = track.state().velocity().norm_squared()
-                            / (2.0 * self.rules.speed.powi(2));
-                        let expected = context.expectation(&track)?;
-                        let fit = expected.fit(line, self.rules.gate)?;
-                        // Against one other target in the view: the line is there, so it is not
-                        // weighed by P_D.
-                        let ratio = fit.log_ratio(1.0, self.rules.clutter_per_sr(known)) - unlikely;
-                        let one_target = OneTargetTest::of_one(camera, one.sight.clone());
-                        let mut reading = Reading {
-                            of: (camera.clone(), one.number),
-                            track: Box::new(track),
-                            one_target,
-                            newest: name,
-                        };
-                        reading.take(context, index, &expected, ratio, &self.rules)?;
-                        (reading.ratio() > GIVEN_UP).then_some(reading)
-                    });
-                one.readings.extend(reading);
+                let reading = Reading::begin(camera, one, index, context, &self.rules);
+                one.readings.extend(reading.filter(|reading| reading.ratio() > GIVEN_UP));
             }
         }
     }
 
     /// Confirms the readings that this exposure has made sure. Other readings of the same lines are
     /// rivals, unless they give the same target.
-    fn settle(&mut self, context: &ReadingContext<'_>) -> Vec<Start> {
+    fn settle(&mut self, context: &ReadingContext<'_>) -> Vec<NewTrack> {
         let ReadingContext { exposure, motion, .. } = *context;
         let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
         let all: Vec<&Reading> =
@@ -285,36 +245,38 @@ impl Handover {
             .iter()
             .copied()
             .filter(|one| one.is_of(exposure) && one.ratio() >= MARGIN && one.track.is_placed())
-            .filter(|one| {
-                // Rivals share the newest line or the direction that was followed first.
-                let mut rivals = all.iter().filter(|other| {
-                    other.ratio() > one.ratio() - MARGIN
-                        && (other.newest == one.newest || other.of == one.of)
-                });
-                rivals.all(|other| same_target(&state(one), &state(other)))
-            })
+            .filter(|one| rivals(one, &all).all(|other| same_target(&state(one), &state(other))))
             .collect();
         sure.sort_by(|one, other| other.ratio().total_cmp(&one.ratio()));
-        let mut found: Vec<Track> = Vec::new();
+        let mut found: Vec<FusedTrack> = Vec::new();
         for reading in sure {
-            if found.iter().all(|track| !same_target(track.state(), &state(reading))) {
-                let mut track = Track::clone(&reading.track);
+            if !is_among(&found, &state(reading)) {
+                let mut track = FusedTrack::clone(&reading.track);
                 track.status = TrackStatus::Confirmed;
                 track.score = self.rules.tracking.confirm_score;
-                track.born = track.updated;
+                track.born = track.updated_at;
                 track.observe();
                 found.push(track);
             }
         }
-        let is_found = |reading: &Reading| {
-            found.iter().any(|track| same_target(track.state(), &state(reading)))
-        };
-        let settled: BTreeSet<u64> =
-            all.iter().filter(|reading| is_found(reading)).map(|reading| reading.of.1).collect();
+        let settled = all.iter().filter(|reading| is_among(&found, &state(reading)));
+        let settled: BTreeSet<u64> = settled.map(|reading| reading.of.1).collect();
         for seen in self.seen.values_mut() {
             seen.retain(|one| !settled.contains(&one.number));
         }
-        let start = |track| Start { track, cameras: 2, claimed_by: BTreeSet::new() };
+        let start = |track| NewTrack { track, cameras: 2, provisional_owners: BTreeSet::new() };
         found.into_iter().map(start).collect()
     }
+}
+
+/// The readings that are nearly as likely as one, or likelier, and share its newest line or the
+/// direction that was followed first; itself among them.
+fn rivals<'a>(one: &'a Reading, all: &'a [&'a Reading]) -> impl Iterator<Item = &'a Reading> + 'a {
+    let near = all.iter().copied().filter(|other| other.ratio() > one.ratio() - MARGIN);
+    near.filter(|other| other.newest == one.newest || other.of == one.of)
+}
+
+/// Whether one of these tracks is of the target of this state.
+fn is_among(found: &[FusedTrack], state: &KinematicState) -> bool {
+    found.iter().any(|track| same_target(track.state(), state))
 }

@@ -5,10 +5,11 @@ use crossfix_message::CameraName;
 
 use super::super::MAX_LINES;
 use super::super::one_target::{Mobility, OneTargetTest};
+use super::seen::SeenDirection;
 use crate::cameras::{KnownCamera, view_sr};
 use crate::motion::MotionSetup;
 use crate::spatial::LineId;
-use crate::track::{Track, TrackBearing, TrackExpectation};
+use crate::track::{FusedTrack, TrackBearing, TrackExpectation};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
@@ -65,7 +66,7 @@ impl ReadingContext<'_> {
     }
 
     /// The bearing of a track that is predicted for the exposure's camera.
-    pub(super) fn expectation(&self, track: &Track) -> Option<TrackExpectation> {
+    pub(super) fn expectation(&self, track: &FusedTrack) -> Option<TrackExpectation> {
         let (camera, origin) = (&self.exposure.camera, self.known.camera.pose().position());
         track.expectation(self.exposure.time, camera, origin, &self.uncertainty(), self.motion)
     }
@@ -76,12 +77,40 @@ impl ReadingContext<'_> {
 pub(super) struct Reading {
     /// The camera that saw it first, and the number of the direction it followed.
     pub(super) of: (CameraName, u64),
-    pub(super) track: Box<Track>,
+    pub(super) track: Box<FusedTrack>,
     pub(super) one_target: OneTargetTest,
     pub(super) newest: LineId,
 }
 
 impl Reading {
+    /// The reading that what `camera` has followed alone is now seen in the exposure's line of this
+    /// index. `None` if the two do not meet, or the numbers fail.
+    pub(super) fn begin(
+        camera: &CameraName,
+        one: &SeenDirection,
+        index: usize,
+        context: &ReadingContext<'_>,
+        rules: &Rules,
+    ) -> Option<Self> {
+        let ReadingContext { exposure, known, motion, .. } = *context;
+        let line = &exposure.sightings[index].line;
+        let track = one.placed(camera, line, exposure.time, rules, motion)?;
+        // Price of the velocity that the reading implies: v^2 / (2 sd^2), of a prior about zero.
+        let unlikely = track.state().velocity().norm_squared() / (2.0 * rules.speed.powi(2));
+        let expected = context.expectation(&track)?;
+        let fit = expected.fit(line, rules.gate)?;
+        // Against one other target in the view: the line is there, so it is not weighed by P_D.
+        let ratio = fit.log_ratio(1.0, rules.clutter_per_sr(known)) - unlikely;
+        let mut reading = Self {
+            of: (camera.clone(), one.number),
+            track: Box::new(track),
+            one_target: OneTargetTest::of_one(camera, one.sight.clone()),
+            newest: LineId::new(exposure, index),
+        };
+        reading.take(context, index, &expected, ratio, rules)?;
+        Some(reading)
+    }
+
     /// Updates the reading with the exposure's best line; returns whether the reading is still
     /// open: not if that line belongs to a track.
     pub(super) fn advance(&mut self, context: &ReadingContext<'_>, rules: &Rules) -> bool {
@@ -123,7 +152,13 @@ impl Reading {
         let bearing = TrackBearing { uncertainty: &uncertainty, ..exposure.bearing(line) };
         let density = motion.density(self.track.model_probabilities());
         self.track.measurement_update(bearing, motion)?;
-        self.track.look(camera, *time, true, rules.tracking.detection_probability, motion);
+        self.track.note_visibility(
+            camera,
+            *time,
+            true,
+            rules.tracking.detection_probability,
+            motion,
+        );
         // If two other cameras see something at the same time, their agreement tells nothing about
         // what the first camera saw before.
         let is_joint = self.track.residuals.iter().any(|(name, residual)| {
@@ -141,14 +176,13 @@ impl Reading {
                 self.one_target.see_first(&bearing, rules.speed / range, first_ratio);
             }
         }
-        self.newest = (camera.clone(), exposure.sequence, index);
+        self.newest = LineId::new(exposure, index);
         Some(())
     }
 
     /// Whether its newest line is of this exposure.
     pub(super) fn is_of(&self, exposure: &Exposure) -> bool {
-        let (camera, sequence, _) = &self.newest;
-        *camera == exposure.camera && *sequence == exposure.sequence
+        self.newest.is_of(exposure)
     }
 
     /// Log-likelihood ratio of one target against one target per camera.

@@ -4,15 +4,16 @@ use std::collections::BTreeSet;
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, Ray, SightLine, passing_ranges};
-use crossfix_message::{CameraName, Solver, Timestamp};
+use crossfix_message::{CameraName, Cued, Solver, Timestamp};
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 use super::super::sight::DirectionFilter;
 use super::Rules;
 use super::reading::Reading;
+use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
-use crate::track::Track;
+use crate::track::FusedTrack;
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, Tracking};
 
@@ -22,7 +23,7 @@ use crate::{Exposure, Tracking};
 const TURNING_SD: f64 = 0.3;
 /// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, which is lively. With half of
 /// it, what turns hard is lost; with twice as much, two directions are too soon alike.
-pub(super) const TURNING_DENSITY: f64 = 3e-4;
+const TURNING_DENSITY: f64 = 3e-4;
 /// Standard deviation of the logarithm of an unknown range: the density at its middle is as if all
 /// ranges over a factor of 150 were equally likely. With half of it (a factor of 12) lines that
 /// cross by chance gain 0.7 in log-likelihood.
@@ -96,6 +97,35 @@ impl SeenDirection {
         self.score >= tracking.confirm_score
     }
 
+    /// Whether it is still of use: not if it has been silent for as long as a track would be kept,
+    /// nor if it was lost before it was sure.
+    pub(super) fn is_worth_keeping(&self, now: Timestamp, rules: &Rules) -> bool {
+        let silent_s = now.seconds_since(self.sight.time);
+        if self.is_sure(&rules.tracking) {
+            silent_s <= rules.tracking.lost_after_s || !self.readings.is_empty()
+        } else {
+            silent_s <= rules.pair_s || !self.is_lost(now, &rules.tracking)
+        }
+    }
+
+    /// Its prediction for cueing, as `camera` follows it, if its unknown range is about `range`
+    /// (m).
+    pub(super) fn cue_target(
+        &self,
+        camera: &CameraName,
+        now: Timestamp,
+        range: f64,
+        speed: f64,
+    ) -> Option<CueTarget> {
+        let state = self.state_at(range, speed)?;
+        let of = Cued { track_id: 0, camera: camera.to_string(), image_track_id: self.image_track };
+        let seen_from = Some(self.line.line.origin);
+        Some(CueTarget::new(of, now, seen_from, |time| {
+            let ahead_s = time.seconds_since(self.sight.time);
+            state.predicted(ahead_s, TURNING_DENSITY * range.powi(2))
+        }))
+    }
+
     /// The direction predicted to a time.
     pub(super) fn at(&self, time: Timestamp) -> DirectionFilter {
         let mut sight = self.sight.clone();
@@ -113,7 +143,7 @@ impl SeenDirection {
         time: Timestamp,
         rules: &Rules,
         motion: &MotionSetup,
-    ) -> Option<Track> {
+    ) -> Option<FusedTrack> {
         let Self { sight, line: last, uncertainty, .. } = self;
         let max_range_m = rules.max_range_m;
         let by_now = Ray { origin: last.line.origin, direction: self.at(time).direction };
@@ -125,7 +155,7 @@ impl SeenDirection {
         let observability = Observability::unexamined(6);
         let (velocity, solver) = (VelocityKnowledge::Solved, Solver::Map);
         let fix = Fix { time: sight.time, state, velocity, solver, observability };
-        Some(Track::start_alone(&fix, camera, last, *uncertainty, motion))
+        Some(FusedTrack::start_alone(&fix, camera, last, *uncertainty, motion))
     }
 
     /// Its position and velocity at its last line, if its unknown range is about `range` (m). The

@@ -9,7 +9,10 @@ use nalgebra::Point3;
 
 use super::{Above, LogPlace, LogRow};
 
+/// Columns of a log in metres from the site's origin, by their names in the table's head.
 const LOCAL: [&str; 4] = ["time_s", "east_m", "north_m", "up_m"];
+/// Columns of a log in WGS84 degrees and metres of height. Where a table has both forms, that in
+/// metres is read.
 const GEODETIC: [&str; 4] = ["time_s", "latitude_deg", "longitude_deg", "height_m"];
 
 /// Reads the columns of either form and ignores all others.

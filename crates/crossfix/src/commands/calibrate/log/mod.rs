@@ -20,7 +20,7 @@ pub enum LogKind {
     Rtk,
     /// With corrections: decimetres.
     Dgps,
-    /// A consumer's receiver: metres, and alike for minutes.
+    /// A consumer's receiver: errors of metres that stay the same for minutes.
     Consumer,
 }
 
@@ -59,7 +59,7 @@ pub enum LogHeight {
 
 /// How a log's times and positions are to be interpreted.
 #[derive(Clone, Copy, Debug)]
-pub struct Reading {
+pub struct LogReading {
     pub errors: LogErrors,
     /// Origin of the site; if absent, the log's first position.
     pub anchor: Option<Geodetic>,
@@ -102,7 +102,7 @@ enum Above {
 }
 
 /// Reads a log: GPX if the file's name says so, NMEA by the first character, otherwise columns.
-pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
+pub fn read(path: &Path, reading: &LogReading) -> anyhow::Result<FlightLog> {
     let is_gpx = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gpx"));
     let rows = if is_gpx {
         gpx::read(path)
@@ -132,7 +132,7 @@ fn begins_with(path: &Path, letter: u8) -> bool {
     read.is_ok() && first == [letter]
 }
 
-impl Reading {
+impl LogReading {
     /// A row with its height converted to height above the ellipsoid.
     fn placed(&self, row: LogRow) -> anyhow::Result<LogRow> {
         ensure!(
@@ -153,8 +153,8 @@ impl Reading {
         let raise_m = match (self.height, above) {
             (LogHeight::Ellipsoid, Above::Unsaid) => 0.0,
             (LogHeight::Ellipsoid | LogHeight::Sea, _) => self.geoid_m.or(said_m).context(
-                "it does not say how far the sea, from which its heights count, is above the ellipsoid: \
-                 --height sea --geoid METRES (in Europe 30 to 60)",
+                "it does not say how far the sea, from which its heights count, is above the \
+                 ellipsoid: --height sea --geoid METRES (in Europe 30 to 60)",
             )?,
             (LogHeight::Takeoff, _) => self.anchor.map_or(0.0, |anchor| anchor.height()),
         };
@@ -195,7 +195,7 @@ fn first_place(rows: &[LogRow]) -> Option<Geodetic> {
 mod tests {
     use super::*;
 
-    const READING: Reading = Reading {
+    const READING: LogReading = LogReading {
         errors: LogErrors { sd_m: 1.0, drift_sd_m: 1.0, drift_time_s: 200.0 },
         anchor: None,
         is_gps_time: false,
@@ -204,7 +204,7 @@ mod tests {
         antenna_m: 0.0,
     };
 
-    fn log(name: &str, text: &str, reading: &Reading) -> anyhow::Result<FlightLog> {
+    fn log(name: &str, text: &str, reading: &LogReading) -> anyhow::Result<FlightLog> {
         let folder = tempfile::tempdir()?;
         let path = folder.path().join(name);
         std::fs::write(&path, text)?;
@@ -224,7 +224,7 @@ mod tests {
         assert!((there.z - 2.0).abs() < 1e-3, "{there}");
         let anchor = Geodetic::from_degrees(48.3538, 11.7861, 480.0).unwrap();
         let reading =
-            Reading { anchor: Some(anchor), is_gps_time: true, antenna_m: 0.1, ..READING };
+            LogReading { anchor: Some(anchor), is_gps_time: true, antenna_m: 0.1, ..READING };
         let first = log("drone.csv", SECOND, &reading).unwrap().samples[0];
         assert!((first.position.z - 9.9).abs() < 1e-6, "{}", first.position);
         assert_eq!(first.time_s, 82.0);
@@ -273,7 +273,7 @@ mod tests {
         assert!((samples[1].time_s - samples[0].time_s - 1.0).abs() < 1e-6);
         assert!((samples[1].position.z - 2.0).abs() < 1e-3);
         let anchor = Geodetic::from_degrees(48.3538, 11.786_1, 486.5).unwrap();
-        let reading = Reading { anchor: Some(anchor), ..READING };
+        let reading = LogReading { anchor: Some(anchor), ..READING };
         let first = log("drone.nmea", &text, &reading).unwrap().samples[0];
         assert!(first.position.z.abs() < 1e-3, "440 m above a sea that is 46.5 m up: {first:?}");
         let no_geoid: String = NMEA
@@ -305,7 +305,7 @@ mod tests {
     fn heights_count_from_the_sea_or_the_take_off() {
         let anchor = Geodetic::from_degrees(48.3538, 11.7861, 500.0).unwrap();
         let up = |height, geoid_m| {
-            let reading = Reading { anchor: Some(anchor), height, geoid_m, ..READING };
+            let reading = LogReading { anchor: Some(anchor), height, geoid_m, ..READING };
             log("drone.csv", SECOND, &reading).map(|log| log.samples[0].position.z)
         };
         let near = |up: f64, metres: f64| assert!((up - metres).abs() < 1e-6, "{up}");
@@ -316,7 +316,7 @@ mod tests {
         assert!(error.contains("--geoid"), "{error}");
         assert!(up(LogHeight::Ellipsoid, Some(46.5)).is_err());
         let local = "time_s,east_m,north_m,up_m\n1,2,3,4\n";
-        let reading = Reading { height: LogHeight::Takeoff, ..READING };
+        let reading = LogReading { height: LogHeight::Takeoff, ..READING };
         let error = format!("{:#}", log("drone.csv", local, &reading).unwrap_err());
         assert!(error.contains("in degrees"), "{error}");
     }

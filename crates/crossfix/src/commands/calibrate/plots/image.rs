@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use crossfix_calibration::{CalibratedCamera, CameraComparison, CameraResult};
+use crossfix_calibration::{CalibratedCamera, CameraComparison, CameraResult, ShownPixel};
 use crossfix_geometry::{ImageSize, Pixel};
 use nalgebra::Vector2;
 use plotters::prelude::*;
 
-use super::panel::{Area, Chart, FIRST, Failure, Ranges, Words, frame, nothing};
+use super::panel::{Chart, FIRST, Failure, PanelText, PlotArea, Ranges, frame, nothing};
 
 /// Number of cells of an image, across and down. With half as many each way, the mean of a cell
 /// would hide how the lens bends within it.
@@ -21,11 +21,11 @@ const ARROW_SHARE: f64 = 0.9;
 
 /// A plot frame for an image, with rows counted downwards.
 fn image<'a, 'b>(
-    area: &'a Area<'b>,
+    area: &'a PlotArea<'b>,
     title: String,
     size: ImageSize,
 ) -> Result<Chart<'a, 'b>, Failure> {
-    let words = Words { title, x: "px", y: "px" };
+    let words = PanelText { title, x: "px", y: "px" };
     frame(area, &words, Ranges { x: 0.0..f64::from(size.width), y: f64::from(size.height)..0.0 })
 }
 
@@ -59,7 +59,7 @@ impl Arrows {
 }
 
 /// The mean of the labels' residuals in each cell: the remaining error of the lens.
-pub fn mean_residuals(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+pub fn mean_residuals(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
     let size = camera.camera.model().intrinsics().size;
     let [across, down] = cell_px(size);
     let mut cells: BTreeMap<(usize, usize), (Vector2<f64>, u32)> = BTreeMap::new();
@@ -89,10 +89,10 @@ pub fn mean_residuals(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fail
 pub fn apart(
     comparison: &CameraComparison,
     second: &CalibratedCamera,
-    area: &Area<'_>,
+    area: &PlotArea<'_>,
 ) -> Result<(), Failure> {
     let size = second.camera.model().intrinsics().size;
-    let arrow = |(first, second): &(Pixel, Pixel)| {
+    let arrow = |ShownPixel { first, second }: &ShownPixel| {
         (*first, Vector2::new(second.x() - first.x(), second.y() - first.y()))
     };
     let arrows = Arrows(comparison.pixels.iter().map(arrow).collect());
@@ -104,7 +104,7 @@ pub fn apart(
 }
 
 /// Pointing SD of the camera in each cell, mrad; grey where the lens is not known.
-pub fn pointing(camera: &CalibratedCamera, area: &Area<'_>) -> Result<(), Failure> {
+pub fn pointing(camera: &CalibratedCamera, area: &PlotArea<'_>) -> Result<(), Failure> {
     let size = camera.camera.model().intrinsics().size;
     let [across, down] = cell_px(size);
     let title = format!("{}: pointing known to [mrad], at {:.0} m", camera.name, camera.range_m);

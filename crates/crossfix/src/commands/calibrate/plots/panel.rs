@@ -6,13 +6,15 @@ use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
-pub type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+pub type PlotArea<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 pub type Failure = Box<dyn std::error::Error>;
 pub type Chart<'a, 'b> =
     ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
-/// Colours of a panel's two series: the axes of an image, or along and across the motion.
+/// Colour of a panel's first series: an image's x axis, or along the motion. A dark blue, which is
+/// also told from the second where colours are not.
 pub const FIRST: RGBColor = RGBColor(31, 90, 160);
+/// Colour of a panel's second series: an image's y axis, or across the motion.
 pub const SECOND: RGBColor = RGBColor(200, 70, 20);
 
 /// Most points drawn of a series: the eye sees no more, and the file stays small. With half as many
@@ -20,7 +22,7 @@ pub const SECOND: RGBColor = RGBColor(200, 70, 20);
 const MOST_POINTS: usize = 1500;
 
 /// Title and axis labels of a panel.
-pub struct Words<'a> {
+pub struct PanelText<'a> {
     pub title: String,
     pub x: &'a str,
     pub y: &'a str,
@@ -34,8 +36,8 @@ pub struct Ranges {
 
 /// A frame with axes and labels.
 pub fn frame<'a, 'b>(
-    area: &'a Area<'b>,
-    words: &Words<'_>,
+    area: &'a PlotArea<'b>,
+    words: &PanelText<'_>,
     ranges: Ranges,
 ) -> Result<Chart<'a, 'b>, Failure> {
     let mut chart = ChartBuilder::on(area)
@@ -55,7 +57,7 @@ pub fn frame<'a, 'b>(
 }
 
 /// A panel with no data, and the reason.
-pub fn nothing(area: &Area<'_>, title: &str, why: &str) -> Result<(), Failure> {
+pub fn nothing(area: &PlotArea<'_>, title: &str, why: &str) -> Result<(), Failure> {
     area.draw(&Text::new(title.to_owned(), (60, 12), ("sans-serif", 15)))?;
     area.draw(&Text::new(why.to_owned(), (60, 60), ("sans-serif", 13)))?;
     Ok(())
@@ -88,7 +90,7 @@ pub fn curve(
 }
 
 /// Names of a panel's two series, each in its colour.
-pub fn legend(area: &Area<'_>, names: [&str; 2]) -> Result<(), Failure> {
+pub fn legend(area: &PlotArea<'_>, names: [&str; 2]) -> Result<(), Failure> {
     /// Width of a letter, px.
     const LETTER_PX: usize = 7;
     let mut x = 66;

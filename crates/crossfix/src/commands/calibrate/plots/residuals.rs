@@ -5,36 +5,37 @@ use crossfix_calibration::{CameraResult, FittedLabel};
 use plotters::prelude::*;
 
 use super::panel::{
-    Area, FIRST, Failure, Ranges, SECOND, Words, curve, dots, frame, legend, nothing, span, thinned,
+    FIRST, Failure, PanelText, PlotArea, Ranges, SECOND, curve, dots, frame, legend, nothing, span,
+    thinned,
 };
 
 /// Residuals up to this many SDs are shown: larger ones belong to something else, and are counted.
 /// With half of it one good label in forty would be counted, too.
 const SHOWN: f64 = 5.0;
-/// A target that moves more slowly in the image tells nothing about clocks, pixels/s. With half of
+/// A target that moves more slowly in the image shows nothing of clocks, pixels/s. With half of
 /// it an error of one pixel would be drawn as 100 ms instead of 50.
 const LEAST_MOTION_PX_PER_S: f64 = 20.0;
-/// Medians are taken over this time, s: errors of labels are correlated for up to a second or two.
-/// With half of it successive medians share errors, which look like a clock that wanders.
+/// Medians are computed over this time, s: errors of labels are correlated for up to a second or
+/// two. With half of it successive medians share errors, which look like a clock that wanders.
 const BLOCK_S: f64 = 3.0;
 /// Bars of a histogram. With half as many each would be 0.4 SDs wide.
 const BARS: usize = 50;
 /// Correlations are shown up to the longest time for which errors of labels may be correlated, s.
-/// With half of it one that lasts so long looks as if it never ended.
+/// With half of it one that lasts this long looks as if it never ended.
 const LONGEST_LAG_S: f64 = 3.0;
 /// Number of lags at which the correlation is estimated. With half as many a correlation that lasts
 /// for less than 0.15 s would not show.
 const LAGS: usize = 40;
 
 /// The residuals of both axes, over the camera's own time.
-pub fn over_time(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+pub fn over_time(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
     let shown = SHOWN * camera.noise.sd_px();
     let beyond = camera.fitted.iter().filter(|label| label.beside_px.amax() > shown).count();
     let title = format!("{}: labels beside the way ({beyond} farther off)", camera.name);
     let Some(time) = span(camera.fitted.iter().map(|label| label.own_time_s)) else {
         return nothing(area, &title, "too few labels");
     };
-    let words = Words { title, x: "its own time [s]", y: "px" };
+    let words = PanelText { title, x: "its own time [s]", y: "px" };
     let mut chart = frame(area, &words, Ranges { x: time, y: -shown..shown })?;
     for (axis, colour) in [(0, FIRST), (1, SECOND)] {
         let points = thinned(&camera.fitted).map(|label| (label.own_time_s, label.beside_px[axis]));
@@ -45,7 +46,7 @@ pub fn over_time(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
 
 /// Shows clock errors: how far labels lie ahead along the target's motion, in time, beside how far
 /// they lie across it, which no clock error explains.
-pub fn along_and_across(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+pub fn along_and_across(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
     let title = "along and across the motion, medians of 3 s".to_owned();
     let along = medians(&camera.fitted, FittedLabel::ahead_s);
     let across = medians(&camera.fitted, FittedLabel::across_s);
@@ -56,7 +57,7 @@ pub fn along_and_across(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fa
     sizes.sort_unstable_by(f64::total_cmp);
     // The scale leaves out the largest fiftieth, which a turn or another object causes.
     let shown = (1.3 * sizes[(sizes.len() - 1) * 49 / 50]).max(1.0);
-    let words = Words { title, x: "its own time [s]", y: "ms" };
+    let words = PanelText { title, x: "its own time [s]", y: "ms" };
     let mut chart = frame(area, &words, Ranges { x: time, y: -shown..shown })?;
     for (points, colour) in [(along, FIRST), (across, SECOND)] {
         let points = points.into_iter().filter(|(_, ms)| ms.abs() < shown);
@@ -87,7 +88,7 @@ fn median_of(block: &[(f64, f64)]) -> Option<(f64, f64)> {
 
 /// Histogram of the residuals of both axes in SDs, with the normal curve that they are assumed to
 /// follow.
-pub fn histogram(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+pub fn histogram(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
     let noise = camera.noise;
     let title = format!("in deviations of {:.2} px, and a normal curve", noise.sd_px());
     let width = 2.0 * SHOWN / BARS as f64;
@@ -104,7 +105,7 @@ pub fn histogram(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
     }
     let normal = |x: f64| (-x * x / 2.0).exp() / std::f64::consts::TAU.sqrt();
     let most = bars.iter().copied().fold(normal(0.0), f64::max);
-    let words = Words { title, x: "deviations", y: "density" };
+    let words = PanelText { title, x: "deviations", y: "density" };
     let mut chart = frame(area, &words, Ranges { x: -SHOWN..SHOWN, y: 0.0..1.1 * most })?;
     let low = |bar: usize| bar as f64 * width - SHOWN;
     chart.draw_series(bars.iter().enumerate().map(|(bar, height)| {
@@ -114,7 +115,7 @@ pub fn histogram(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
 }
 
 /// Autocorrelation of the labels' errors over the time between them, with the fitted noise model.
-pub fn autocorrelation(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+pub fn autocorrelation(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
     let noise = camera.noise;
     let title = format!(
         "two labels err alike: new each time {:.2} px, lasting {:.2} px for {:.2} s",
@@ -139,7 +140,7 @@ pub fn autocorrelation(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fai
         }
     }
     let variance = squares / f64::from(count.max(1));
-    let words = Words { title, x: "time between them [s]", y: "correlation" };
+    let words = PanelText { title, x: "time between them [s]", y: "correlation" };
     let longest_s = step_s * LAGS as f64;
     let mut chart = frame(area, &words, Ranges { x: 0.0..longest_s, y: -0.3..1.0 })?;
     let found = (1..LAGS)

@@ -3,6 +3,7 @@
 use crossfix_message::Datum;
 
 use super::results::{CameraResult, FlightResult};
+use crate::calibrated_camera::ClockOffset;
 use crate::survey::Survey;
 
 /// No clock is taken to be known better than this at another time than that of its calibration, s:
@@ -13,11 +14,11 @@ const LEAST_CLOCK_SD_S: f64 = 1e-3;
 /// Keeps a site as a whole where an earlier calibration has it: its datum may be off by what was
 /// stated then. The common time is the one that the cameras' clocks showed by their earlier
 /// calibration.
-pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey) {
+pub(super) fn keep_known_site(result: &mut FlightResult, survey: &Survey) {
     if let (Some(datum), Some(known)) = (&mut result.datum, survey.known_datum()) {
         *datum = known.clone();
     }
-    let Some((later_s, sd_s)) = later(result, survey) else { return };
+    let Some(ClockOffset { ahead_s: later_s, sd_s }) = later(result, survey) else { return };
     for camera in &mut result.cameras {
         camera.clock.knots.iter_mut().for_each(|knot| knot.ahead_s += later_s);
         camera.fitted.iter_mut().for_each(|label| label.time_s += later_s);
@@ -27,34 +28,35 @@ pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey) {
     }
 }
 
-/// How much later the common time is by the earlier calibration of the clocks, and the standard
-/// deviation of that, s: the median of what the cameras state, as one clock may have been set
-/// again. Clocks that no flight has calibrated are not counted.
-fn later(result: &FlightResult, survey: &Survey) -> Option<(f64, f64)> {
-    let mut said: Vec<(f64, f64)> =
+/// How much later the common time is by the earlier calibration of the clocks: the median of what
+/// the cameras state, as one clock may have been set again. Clocks that no flight has calibrated
+/// are not counted.
+fn later(result: &FlightResult, survey: &Survey) -> Option<ClockOffset> {
+    let mut said: Vec<ClockOffset> =
         result.cameras.iter().filter_map(|camera| later_by_clock(camera, survey)).collect();
-    said.sort_by(|a, b| a.0.total_cmp(&b.0));
+    said.sort_by(|a, b| a.ahead_s.total_cmp(&b.ahead_s));
     // Weighted median: the value at which the summed weights 1 / sd^2 reach half of their total.
-    let half: f64 = said.iter().map(|(_, sd_s)| sd_s.powi(-2)).sum::<f64>() / 2.0;
+    let half: f64 = said.iter().map(|one| one.sd_s.powi(-2)).sum::<f64>() / 2.0;
     let mut below = 0.0;
-    let (middle, _) = *said.iter().find(|(_, sd_s)| {
-        below += sd_s.powi(-2);
+    let middle = said.iter().find(|one| {
+        below += one.sd_s.powi(-2);
         below >= half
     })?;
     // A median's variance is pi / 2 times a mean's, or more where the cameras differ by more than
     // they state.
-    let beside: f64 =
-        said.iter().map(|(later_s, sd_s)| ((later_s - middle) / sd_s).abs().min(3.0).powi(2)).sum();
+    let deviations = said.iter().map(|one| (one.ahead_s - middle.ahead_s) / one.sd_s);
+    let beside: f64 = deviations.map(|deviations| deviations.abs().min(3.0).powi(2)).sum();
     let spread = (beside / said.len() as f64).max(1.0);
-    Some((middle, (std::f64::consts::FRAC_PI_2 * spread / (2.0 * half)).sqrt()))
+    let sd_s = (std::f64::consts::FRAC_PI_2 * spread / (2.0 * half)).sqrt();
+    Some(ClockOffset { ahead_s: middle.ahead_s, sd_s })
 }
 
 /// The same by the clock of one camera.
-fn later_by_clock(found: &CameraResult, survey: &Survey) -> Option<(f64, f64)> {
+fn later_by_clock(found: &CameraResult, survey: &Survey) -> Option<ClockOffset> {
     let known = survey.known(&found.name)?;
     known.clock.knots_s.first()?;
     let middle = found.clock.knots.get(found.clock.knots.len() / 2)?;
-    let (ahead_s, sd_s) = known.clock.at(middle.time_s);
+    let ClockOffset { ahead_s, sd_s } = known.clock.at(middle.time_s);
     // Compared in the middle of the flight, where its own rate matters least.
-    Some((ahead_s - middle.ahead_s, sd_s.max(LEAST_CLOCK_SD_S)))
+    Some(ClockOffset { ahead_s: ahead_s - middle.ahead_s, sd_s: sd_s.max(LEAST_CLOCK_SD_S) })
 }

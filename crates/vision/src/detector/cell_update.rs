@@ -1,0 +1,66 @@
+//! How the background's cells learn an image.
+
+use pulp::Arch;
+
+use super::level::{CONTRAST_SPREAD, OUTLYING};
+
+/// Squared slope, (levels per cell)^2, by central differences between the neighbours.
+#[inline(always)]
+pub(super) fn slope_squared([left, right]: [f32; 2], [above, below]: [f32; 2]) -> f32 {
+    0.25 * ((right - left) * (right - left) + (below - above) * (below - above))
+}
+
+/// One image's update of the background's cells.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct CellUpdate {
+    pub(super) share: f32,
+    pub(super) noise: f32,
+    pub(super) sway: f32,
+    pub(super) contrast: f32,
+}
+
+/// One row of the background, or a part of it.
+#[derive(Debug)]
+pub(super) struct BackgroundRow<'a> {
+    pub(super) now: &'a [f32],
+    pub(super) textures: &'a [f32],
+    pub(super) mean: &'a mut [f32],
+    pub(super) variance: &'a mut [f32],
+    pub(super) change: &'a mut [f32],
+}
+
+impl CellUpdate {
+    /// Variance of each cell's change in a row, from the scene's sway and the light: `sway slope^2
+    /// + (CONTRAST_SPREAD mean)^2`.
+    pub(super) fn textures(self, above: &[f32], here: &[f32], below: &[f32], to: &mut Vec<f32>) {
+        let Self { sway, .. } = self;
+        to.clear();
+        to.resize(here.len(), 0.0);
+        Arch::new().dispatch(|| {
+            let columns = here.windows(3).zip(&above[1..]).zip(&below[1..]);
+            for (out, ((near, above), below)) in to[1..].iter_mut().zip(columns) {
+                // Beside the sway, light changes the contrast of every cell by a share of its own.
+                let lit = CONTRAST_SPREAD * near[1];
+                *out = sway * slope_squared([near[0], near[2]], [*above, *below]) + lit * lit;
+            }
+        });
+    }
+
+    pub(super) fn learn(self, row: BackgroundRow<'_>) {
+        let Self { share, noise, contrast, .. } = self;
+        Arch::new().dispatch(|| {
+            let learnt = row.mean.iter_mut().zip(row.variance).zip(row.change);
+            for (((mean, variance), change), (now, texture)) in
+                learnt.zip(row.now.iter().zip(row.textures))
+            {
+                // In standard deviations; mean and variance learn from it with a limit on outliers.
+                let off = now - contrast * *mean;
+                let usual = variance.max(noise);
+                *change = off / (usual + texture).sqrt();
+                let most = (OUTLYING * usual).sqrt();
+                *mean += share * off.clamp(-most, most);
+                *variance += share * ((off * off).min(OUTLYING * usual) - *variance);
+            }
+        });
+    }
+}
