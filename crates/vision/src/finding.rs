@@ -8,7 +8,7 @@ use crate::config::Algorithm;
 use crate::detector::{Detector, Found, KnownTarget};
 use crate::figure::meant;
 use crate::followed::{Followed, Follower, TakenUpBy, box_of, describe};
-use crate::frame::{FrameInput, TargetStep};
+use crate::frame::{FrameInput, Others, TargetStep};
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
     TrackerPart,
@@ -269,6 +269,7 @@ impl ImageTracker {
             scene: &self.scene,
             scene_moved: [0.0; 2],
             may_search: false,
+            others: Others::default(),
             config: &self.config,
         };
         let scratch = &mut self.scratch;

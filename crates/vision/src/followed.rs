@@ -85,7 +85,7 @@ impl Follower {
         }
     }
 
-    fn velocity(&self) -> ImagePoint {
+    pub(crate) fn velocity(&self) -> ImagePoint {
         match self {
             Self::Posterior(target) => target.state.velocity(),
             Self::Paper(target) => target.velocity(),
@@ -142,6 +142,17 @@ pub(crate) struct Followed {
 impl Followed {
     pub(crate) fn is_candidate(&self) -> bool {
         matches!(self.origin, TakenUpBy::Detected { is_candidate: true, .. })
+    }
+
+    /// Its box in so many seconds; `None` where it is not seen, or is a candidate.
+    pub(crate) fn expected(&self, after: f64) -> Option<PixelBox> {
+        if self.is_candidate() || !self.target.is_seen() {
+            return None;
+        }
+        let (at, velocity) = (self.target.position(), self.target.velocity());
+        let there = ImagePoint { x: at.x + after * velocity.x, y: at.y + after * velocity.y };
+        let [width, height] = self.target.size();
+        Some(PixelBox::about(there, width, height))
     }
 
     /// Whether it was found by the detector, and has been elsewhere since.

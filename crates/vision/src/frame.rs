@@ -4,7 +4,7 @@ use crossfix_correlation::Plane;
 use nalgebra::Matrix2;
 
 use crate::scene::SceneMemory;
-use crate::{ImagePoint, TrackerConfig};
+use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// The next image, and what goes with it.
 #[derive(Clone, Copy, Debug)]
@@ -22,6 +22,7 @@ pub(crate) struct FrameInput<'a> {
     /// Whether it is this target's turn to be searched for, if it is lost: one per frame, as a
     /// search costs as much as many targets that are followed.
     pub(crate) may_search: bool,
+    pub(crate) others: Others<'a>,
     pub(crate) config: &'a TrackerConfig,
 }
 
@@ -29,6 +30,24 @@ impl FrameInput<'_> {
     /// Columns and rows of the image.
     pub(crate) fn sides(&self) -> [usize; 2] {
         [self.image.width(), self.image.height()]
+    }
+}
+
+/// Where the other targets are: what is there is theirs.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Others<'a> {
+    /// The boxes of all targets that are seen, in the order of the targets: in this image those
+    /// before the target itself, as predicted those after it. `None` for one that is not seen.
+    pub(crate) boxes: &'a [Option<PixelBox>],
+    /// Index of the target itself.
+    pub(crate) own: usize,
+}
+
+impl Others<'_> {
+    /// The others' boxes.
+    pub(crate) fn iter(self) -> impl Iterator<Item = PixelBox> {
+        let others = self.boxes.iter().enumerate().filter(move |(index, _)| *index != self.own);
+        others.filter_map(|(_, place)| *place)
     }
 }
 

@@ -118,6 +118,13 @@ impl ImagePoint {
 }
 
 impl PixelBox {
+    /// Whether two boxes have pixels in common.
+    pub(crate) fn overlaps(&self, other: &Self) -> bool {
+        let (a, b) = (self.centre(), other.centre());
+        (a.x - b.x).abs() < (self.width + other.width) / 2.0
+            && (a.y - b.y).abs() < (self.height + other.height) / 2.0
+    }
+
     /// The middle, as a place: the box of one pixel at (0, 0) has its middle at (0, 0).
     pub fn centre(&self) -> ImagePoint {
         ImagePoint { x: self.x + (self.width - 1.0) / 2.0, y: self.y + (self.height - 1.0) / 2.0 }

@@ -11,7 +11,7 @@ use nalgebra::Matrix2;
 use crate::config::Algorithm;
 use crate::detector::Detector;
 use crate::followed::{Followed, Follower, TakenUpBy, describe};
-use crate::frame::{FrameInput, Measurement};
+use crate::frame::{FrameInput, Measurement, Others};
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
 use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig, TrackerConfigError, TrackerPart};
@@ -119,6 +119,8 @@ pub struct ImageTracker {
     pub(crate) waiting: Vec<PixelBox>,
     pub(crate) followed: Vec<Followed>,
     pub(crate) tracks: Vec<ImageTrack>,
+    /// Memory for the boxes of [`Others`].
+    boxes: Vec<Option<PixelBox>>,
     pub(crate) next_id: u64,
     /// Candidates are numbered down from the largest number; their numbers are never published.
     pub(crate) next_candidate: u64,
@@ -150,6 +152,7 @@ impl ImageTracker {
             waiting: Vec::new(),
             followed: Vec::new(),
             tracks: Vec::new(),
+            boxes: Vec::new(),
             next_id: 1,
             next_candidate: u64::MAX - 1,
             last: None,
@@ -266,11 +269,16 @@ impl ImageTracker {
             scene: &self.scene,
             scene_moved,
             may_search: false,
+            others: Others::default(),
             config: &self.config,
         };
         self.tracks.clear();
-        for followed in &mut self.followed {
-            let frame = FrameInput { may_search: turn == Some(followed.id), ..frame };
+        self.boxes.clear();
+        self.boxes.extend(self.followed.iter().map(|followed| followed.expected(interval)));
+        for (own, followed) in self.followed.iter_mut().enumerate() {
+            let may_search = turn == Some(followed.id);
+            let others = Others { boxes: &self.boxes, own };
+            let frame = FrameInput { may_search, others, ..frame };
             if frame.may_search {
                 followed.searched = Some(time);
             }
@@ -278,6 +286,7 @@ impl ImageTracker {
             if step.measured.is_some() {
                 followed.measured_at = time;
             }
+            self.boxes[own] = step.measured.and_then(|_| followed.expected(0.0));
             let phase = match step.measured {
                 Some(_) => TrackPhase::Tracking,
                 None if followed.target.is_lost() => TrackPhase::Searching,
@@ -400,9 +409,18 @@ impl Followed {
     }
 }
 
-/// Whether two targets lie on each other: their centres within half a box.
+/// Two targets that lie on each other are two where they will be apart after this long, s: they fly
+/// past each other. With half of it the younger of two that overtake each other is given up; with
+/// twice as much two tracks of one target are shown for longer.
+const PARTED_S: f64 = 0.5;
+
+/// Whether two tracks are of one target: their centres are within half a box, now and in a while.
 fn same(one: &Follower, other: &Follower) -> bool {
     let (a, b) = (one.position(), other.position());
+    let (v, w) = (one.velocity(), other.velocity());
     let ([aw, ah], [bw, bh]) = (one.size(), other.size());
-    (a.x - b.x).abs() < aw.max(bw) / 2.0 && (a.y - b.y).abs() < ah.max(bh) / 2.0
+    [0.0, PARTED_S].into_iter().all(|after| {
+        (a.x - b.x + after * (v.x - w.x)).abs() < aw.max(bw) / 2.0
+            && (a.y - b.y + after * (v.y - w.y)).abs() < ah.max(bh) / 2.0
+    })
 }

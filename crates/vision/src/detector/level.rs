@@ -169,7 +169,7 @@ impl Level {
 
     /// Whether the scene in view is no longer that of the background.
     pub(super) fn has_lost_scene(&self) -> bool {
-        self.sway_px() >= 0.99 * f64::from(SWAY_PX[1]) || self.is_lost
+        self.is_lost
     }
 
     /// Where the middle of a background's cell is in the image, px.
@@ -320,12 +320,14 @@ impl Level {
         }
         // A scene without texture shows neither its sway nor whether it is another one.
         let is_textured = textured >= LEAST_TEXTURED;
-        self.is_lost = is_textured && changed as f32 > MOST_CHANGED * textured as f32;
+        self.is_lost = false;
         if is_textured {
             let sway = (changes / slopes).clamp(least, most);
             // A camera that is shaken is believed at once, one that is still only later.
             let share = 1.0 - (-interval / STILL_AGAIN_S).exp() as f32;
             self.sway = sway.max(self.sway + share * (sway - self.sway));
+            self.is_lost = self.sway_px() >= 0.99 * f64::from(SWAY_PX[1])
+                || changed as f32 > MOST_CHANGED * textured as f32;
         }
     }
 

@@ -306,7 +306,11 @@ impl ImageTarget {
         certainty: f64,
         scratch: &mut Scratch,
     ) {
-        if self.identity.is_on_probation() {
+        let [width, height] = self.state.appearance.sides();
+        let own = PixelBox::about(place, width, height);
+        // Where targets overlap, each one's image is partly the other's.
+        if self.identity.is_on_probation() || frame.others.iter().any(|other| other.overlaps(&own))
+        {
             return;
         }
         let learnt = self.state.learn(frame, place, fit, certainty, scratch);
