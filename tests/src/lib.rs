@@ -76,7 +76,7 @@ pub fn followed_rows(path: &Path) -> Vec<FollowedRow> {
     let mut reader = csv::Reader::from_path(path).unwrap();
     assert_eq!(
         reader.headers().unwrap().iter().collect::<Vec<_>>().join(","),
-        "frame,x,y,w,h,ok,us,id,certainty,sd_x,sd_y,vx,vy"
+        "frame,x,y,w,h,ok,us,id,certainty,sd_x,sd_y,vx,vy,contrast,flicker,straightness"
     );
     reader.deserialize().map(Result::unwrap).collect()
 }

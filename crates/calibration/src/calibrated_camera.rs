@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::label_noise::LabelNoise;
-use crate::lens::{self, LensUncertainty, SeenTarget};
+use crate::lens::{self, LensUncertainty, TargetView};
 
 /// A pixel has no bearing where the lens may be off by more than this many deviations of the
 /// labels: in the corners of a wide lens that no flight has crossed it is off by 50 pixels. At
@@ -158,9 +158,9 @@ impl CalibratedCamera {
         Some((bearing.covariance().trace() / 2.0).sqrt())
     }
 
-    fn seen_target(&self, direction: Unit<Vector3<f64>>, range_m: f64) -> SeenTarget<'_> {
+    fn seen_target(&self, direction: Unit<Vector3<f64>>, range_m: f64) -> TargetView<'_> {
         let world_from_camera = self.camera.pose().rotation();
-        SeenTarget { direction: direction.into_inner(), range_m, world_from_camera }
+        TargetView { direction: direction.into_inner(), range_m, world_from_camera }
     }
 
     /// Standard deviation of a bearing due to the lens alone, at the calibration's range: root mean

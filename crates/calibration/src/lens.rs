@@ -174,7 +174,7 @@ pub struct LensUncertainty {
 
 /// A target as a camera sees it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct SeenTarget<'a> {
+pub(crate) struct TargetView<'a> {
     /// In the camera's frame.
     pub(crate) direction: Vector3<f64>,
     pub(crate) range_m: f64,
@@ -182,7 +182,7 @@ pub(crate) struct SeenTarget<'a> {
     pub(crate) world_from_camera: &'a nalgebra::Rotation3<f64>,
 }
 
-impl SeenTarget<'_> {
+impl TargetView<'_> {
     /// Its place in the camera's frame, m.
     fn point(&self) -> Vector3<f64> {
         self.direction * self.range_m
@@ -195,7 +195,7 @@ impl LensUncertainty {
     pub(crate) fn covariance_px2(
         &self,
         intrinsics: &Intrinsics,
-        target: &SeenTarget<'_>,
+        target: &TargetView<'_>,
     ) -> Option<Matrix2<f64>> {
         let seen = project(intrinsics, &target.point())?;
         let count = self.covariance.nrows();
@@ -210,7 +210,7 @@ impl LensUncertainty {
 /// Covariance of a pixel due to a pose's covariance, for the same target.
 pub(crate) fn pose_covariance_px2(
     intrinsics: &Intrinsics,
-    target: &SeenTarget<'_>,
+    target: &TargetView<'_>,
     covariance: &nalgebra::Matrix6<f64>,
 ) -> Option<Matrix2<f64>> {
     let by = by_pose(&project(intrinsics, &target.point())?, target);
@@ -218,7 +218,7 @@ pub(crate) fn pose_covariance_px2(
 }
 
 /// Derivative of a pixel by the camera's rotation about its own axes and by its centre.
-fn by_pose(seen: &Projection, target: &SeenTarget<'_>) -> nalgebra::Matrix2x6<f64> {
+fn by_pose(seen: &Projection, target: &TargetView<'_>) -> nalgebra::Matrix2x6<f64> {
     let mut by_pose = nalgebra::Matrix2x6::zeros();
     // R <- R exp(d) turns the point by point x d, and a centre moved by c moves it by -R' c.
     let turn = seen.by_point * target.point().cross_matrix();

@@ -231,7 +231,9 @@ impl Centre {
                 )
             });
         } else {
-            tracing::info!("camera `{camera}` is used again: its bearings fit the tracks");
+            self.repeats.warn(&format!("used again {camera}"), Instant::now(), || {
+                format!("camera `{camera}` is used again: its bearings fit the tracks")
+            });
         }
     }
 

@@ -7,7 +7,7 @@ use crossfix_message::{
     BearingFrame, BearingTrack, CameraName, ClockSource, ImageTrackState, Payload, Preview,
 };
 use crossfix_video::{CaptureTime, Frame};
-use crossfix_vision::{ImageTrack, Measurement, TrackPhase};
+use crossfix_vision::{ImageTrack, Measurement, TargetFeatures, TrackPhase};
 use jpeg_encoder::{ColorType, Encoder};
 use nalgebra::{Matrix2, Vector2};
 
@@ -79,6 +79,7 @@ impl CameraIdentity {
             score: track.score,
             state: state.into(),
             certainty: track.certainty,
+            features: track.features.map(features),
         })
     }
 
@@ -105,6 +106,11 @@ impl CameraIdentity {
         };
         Some(preview.stamped())
     }
+}
+
+fn features(features: TargetFeatures) -> crossfix_message::TargetFeatures {
+    let TargetFeatures { contrast, flicker, straightness } = features;
+    crossfix_message::TargetFeatures { contrast, flicker, straightness }
 }
 
 /// Predicted place of a track that was not measured in this image, with its covariance: one pixel
@@ -165,6 +171,7 @@ mod tests {
             score: 0.2,
             certainty: 0.1,
             nis: None,
+            features: None,
         };
         let sent = identity.bearing_track(&lost).unwrap();
         assert_eq!(sent.state(), ImageTrackState::Coasting);

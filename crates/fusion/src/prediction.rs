@@ -214,26 +214,26 @@ impl BearingPrediction {
         let noise = self.model.covariance_of(line) * self.factor + self.clock;
         let Spread { steady, shift, cross, .. } = self.known;
         let placed = steady - cross - cross.transpose() - shift - self.clock;
-        Some(Beginning { left: self.model.offset(line)?, shift, noise, placed })
+        Some(Beginning { left: self.model.residual(line)?, shift, noise, placed })
     }
 
     /// How well a bearing fits; `None` if it lies outside the gate. Of the two cases, that the
     /// camera's lasting errors went on or that they were drawn again, the likelier is used.
     pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<BearingFit> {
-        let offset = self.model.offset(line)?;
-        let known = self.fit_by(&self.known, offset, line, gate);
+        let residual = self.model.residual(line)?;
+        let known = self.fit_by(&self.known, residual, line, gate);
         let Some((renewed, probability)) = &self.renewed else { return known };
-        BearingFit::likelier(known, self.fit_by(renewed, offset, line, gate), *probability)
+        BearingFit::likelier(known, self.fit_by(renewed, residual, line, gate), *probability)
     }
 
     fn fit_by(
         &self,
         by: &Spread,
-        offset: Vector2<f64>,
+        residual: Vector2<f64>,
         line: &SightLine,
         gate: Gate,
     ) -> Option<BearingFit> {
-        let innovation = offset - by.shifted;
+        let innovation = residual - by.shifted;
         // A variance along any axis is at most the trace: this cheap test rejects most bearings.
         let longest = by.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
         if innovation.norm_squared() > gate.threshold() * longest {

@@ -229,7 +229,7 @@ impl FusedTrack {
         let dt = time.seconds_since(fix.time);
         let here = fix.state.predicted(dt, 0.0);
         let model = BearingModel::new(line.origin, here.position())?;
-        let offset = model.offset(line)?;
+        let residual = model.residual(line)?;
         let shifts = uncertainty.shifts(&model, here.velocity());
         // `moved`: variance by which an uncertain time and origin displace the line, m^2.
         let moved = (here.velocity().norm() * time_sd_s).powi(2) + origin_sd_m.powi(2);
@@ -237,10 +237,12 @@ impl FusedTrack {
         // NIS = |L^-1 z|^2 with R = L L': a sum of squares cannot become negative, however nearly
         // singular the noise is.
         let factor = noise.cholesky()?;
-        let nis = factor.l().solve_lower_triangular(&offset)?.norm_squared();
+        let nis = factor.l().solve_lower_triangular(&residual)?.norm_squared();
         let inverse = factor.inverse();
-        self.residuals
-            .insert(camera.clone(), MeasurementResidual { time: *time, angle: offset.norm(), nis });
+        self.residuals.insert(
+            camera.clone(),
+            MeasurementResidual { time: *time, angle: residual.norm(), nis },
+        );
         // The line is taken dt after the fix: H = H_p [I, dt I].
         let mut by = Matrix2x6::zeros();
         by.fixed_view_mut::<2, 3>(0, 0).copy_from(&model.by_position());

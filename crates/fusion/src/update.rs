@@ -143,7 +143,7 @@ impl Linearised {
         &Measured { line, camera, errors }: &Measured<'_>,
     ) -> Option<Self> {
         let model = BearingModel::new(line.origin, point.place)?;
-        let offset = model.offset(line)?;
+        let residual = model.residual(line)?;
         let shifts = camera.shifts(&model, point.velocity);
         let by: Matrix2x3<f64> = model.by_position() * point.place_by;
         let tied: Matrix6x2<f64> = ties * shifts.transpose();
@@ -155,8 +155,8 @@ impl Linearised {
         // S = H P H' + H X J' + J X' H' + J W J' + R, with W the covariance of s.
         let spread = by * seen.fixed_rows::<3>(0) + cross + cross.transpose() + noise;
         let (determinant, inverse) = (spread.determinant(), spread.try_inverse()?);
-        // z of the iterated filter, linearised at this point: offset + H x - J E(s).
-        let innovation = offset + by * coordinates.fixed_rows::<3>(0) - shifts * errors.mean;
+        // z of the iterated filter, linearised at this point: residual + H x - J E(s).
+        let innovation = residual + by * coordinates.fixed_rows::<3>(0) - shifts * errors.mean;
         (determinant > 0.0 && spread.m11 > 0.0).then(|| Self {
             by,
             shifts,

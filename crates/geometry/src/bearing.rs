@@ -135,10 +135,10 @@ impl SightLine {
         }
     }
 
-    /// Offset of the direction to a point from this ray on its tangent plane, rad.
+    /// Residual of the direction to a point: its part across this ray, on the ray's tangent plane, rad.
     ///
     /// `None` if the point lies at or behind the origin.
-    pub fn tangent_offset(&self, point: Point3<f64>) -> Option<Vector2<f64>> {
+    pub fn tangent_residual(&self, point: Point3<f64>) -> Option<Vector2<f64>> {
         let offset = point - self.origin;
         let distance = offset.norm();
         (offset.dot(&self.direction) > 0.0).then(|| self.basis.transpose() * (offset / distance))

@@ -5,9 +5,9 @@ use crate::{SightLine, tangent_basis};
 /// The bearing model: the direction in which a camera at `origin` sees a place, and the derivatives
 /// of that by the place, by the camera's pose and by its clock.
 ///
-/// A bearing is compared with its expectation as an offset on the tangent plane at the expected
-/// direction, measured less expected. The Jacobians say how that offset changes with errors of the
-/// expectation: `offset = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp` is
+/// A bearing is compared with its expectation as a residual on the tangent plane at the expected
+/// direction, measured less expected. The Jacobians say how that residual changes with errors of the
+/// expectation: `residual = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp` is
 /// the true place less the expected one (m, world), `de` the true pose less the stated one (a small
 /// rotation vector about the world's axes, rad, then the position, m) and `dt` the stated capture
 /// time less the true one (s).
@@ -25,7 +25,7 @@ use crate::{SightLine, tangent_basis};
 pub struct BearingModel {
     /// Expected direction, world.
     pub direction: Unit<Vector3<f64>>,
-    /// The tangents (columns, world) on which offsets are expressed.
+    /// The tangents (columns, world) on which residuals are expressed.
     pub basis: Matrix3x2<f64>,
     /// Distance of the place, m.
     pub range: f64,
@@ -43,9 +43,9 @@ impl BearingModel {
         Self { direction, basis: tangent_basis(&direction), range }
     }
 
-    /// Offset of a measured line from the expected direction, rad; `None` if the line points to the
-    /// opposite half space.
-    pub fn offset(&self, line: &SightLine) -> Option<Vector2<f64>> {
+    /// Residual of a measured line: measured less expected direction on its
+    /// tangents, rad; `None` if the line points to the opposite half space.
+    pub fn residual(&self, line: &SightLine) -> Option<Vector2<f64>> {
         // z = E' u_measured: the expected direction itself has no part along its own tangents.
         (self.direction.dot(&line.direction) > 0.0)
             .then(|| self.basis.transpose() * line.direction.into_inner())
@@ -129,11 +129,11 @@ mod tests {
             let model = BearingModel::new(origin, place).unwrap();
             let target = Motion { place: place + moved, velocity };
             let line = measured(origin, &target, &Misstated { pose: error, ahead_s: ahead });
-            let offset = model.offset(&line).unwrap();
+            let residual = model.residual(&line).unwrap();
             let expected = model.by_position() * moved
                 + model.by_pose() * error
                 + model.by_time(velocity) * ahead;
-            prop_assert!((offset - expected).norm() < 1e-4 * step * 10.0, "{offset} {expected}");
+            prop_assert!((residual - expected).norm() < 1e-4 * step * 10.0, "{residual} {expected}");
         }
     }
 }

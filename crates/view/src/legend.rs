@@ -10,10 +10,11 @@ pub(crate) fn draw(stream: &RecordingStream) -> Result<(), ViewError> {
     let text = format!(
         "**Orange, blue, green, yellow**: a camera, its sight lines, boxes and residuals.\n\n\
          **Red, violet, pink**: a track, its last ten seconds; in images a ring where the camera \
-         should see it. See-through: not sure, or not seen now. In images the faint rectangle \
-         about a box is the gate in which the agent looks for the target at least.\n\n\
+         should see it. See-through: not sure, or not seen now. Faint rectangles about boxes: \
+         the least gates in which agents look.\n\n\
          **Ellipsoid**: {SIGMAS} standard deviations, {ENLARGED} times too large below \
-         {ENLARGED_UP_TO_M} m. **White**: the truth. The arrow points north."
+         {ENLARGED_UP_TO_M} m. **White**: the truth. The arrow points north; \
+         small ones are a camera's own axes."
     );
     stream.log_static("legend", &TextDocument::new(text).with_media_type(MediaType::markdown()))?;
     Ok(())

@@ -9,6 +9,7 @@ use crate::detector::{Detector, Found, KnownTarget};
 use crate::figure::meant;
 use crate::followed::{Followed, Follower, TakenUpBy, box_of, describe};
 use crate::frame::{FrameInput, Others, TargetStep};
+use crate::tracker::are_near;
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
     TrackerPart,
@@ -97,12 +98,15 @@ impl ImageTracker {
         if origin == TakenUpBy::Given {
             target.begin_centring(&self.config);
         }
+        let is_beneath = |f: &&Followed| are_near(&f.target, &target, 0.0);
+        let began_on = self.followed.iter().find(is_beneath).map(|followed| followed.id);
         let step = TargetStep { measured: None, score: 1.0, certainty: 1.0, nis: None };
         self.tracks.push(describe(id, &target, TrackPhase::Tentative, step));
         self.followed.push(Followed {
             id,
             origin,
             target,
+            began_on,
             measured_at: time,
             since: time,
             searched: None,

@@ -9,7 +9,9 @@ use crate::followed_target::ImageTarget;
 use crate::frame::{FrameInput, TargetStep};
 use crate::paper::PaperTarget;
 use crate::scratch::Scratch;
-use crate::{ImagePoint, ImageTrack, ImageTrackId, PixelBox, TrackPhase, TrackerConfig};
+use crate::{
+    ImagePoint, ImageTrack, ImageTrackId, PixelBox, TargetFeatures, TrackPhase, TrackerConfig,
+};
 
 /// Who took a target up.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -99,6 +101,12 @@ impl Follower {
         }
     }
 
+    /// How it looks and moves; the papers' algorithm does not say.
+    fn features(&self) -> Option<TargetFeatures> {
+        let Self::Posterior(target) = self else { return None };
+        Some(target.state.features())
+    }
+
     /// Width and height of the target, px.
     pub(crate) fn size(&self) -> [f64; 2] {
         match self {
@@ -131,6 +139,8 @@ pub(crate) struct Followed {
     pub(crate) searched: Option<Timestamp>,
     /// Its place in the next image, if somebody has given it.
     pub(crate) cue: Option<ImagePoint>,
+    /// The target on whose place it was taken up, until the two have been apart.
+    pub(crate) began_on: Option<ImageTrackId>,
     /// Since when it has been followed.
     pub(crate) since: Timestamp,
     /// The candidate that is shown in its place while it is lost.
@@ -144,7 +154,7 @@ impl Followed {
         matches!(self.origin, TakenUpBy::Detected { is_candidate: true, .. })
     }
 
-    /// Its box in so many seconds; `None` where it is not seen, or is a candidate.
+    /// Its box after this time, s; `None` where it is not seen, or is a candidate.
     pub(crate) fn expected(&self, after: f64) -> Option<PixelBox> {
         if self.is_candidate() || !self.target.is_seen() {
             return None;
@@ -186,5 +196,6 @@ pub(crate) fn describe(
         score: step.score,
         certainty: step.certainty,
         nis: step.nis,
+        features: target.features(),
     }
 }

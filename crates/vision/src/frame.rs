@@ -1,10 +1,11 @@
 //! What goes into a step of a target, and what comes out.
 
 use crossfix_correlation::Plane;
+use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
 
 use crate::scene::SceneMemory;
-use crate::{ImagePoint, PixelBox, TrackerConfig};
+use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
 /// The next image, and what goes with it.
 #[derive(Clone, Copy, Debug)]
@@ -33,21 +34,47 @@ impl FrameInput<'_> {
     }
 }
 
+/// A target as the others know it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct KnownPlace {
+    pub(crate) id: ImageTrackId,
+    /// Since when it has been followed.
+    pub(crate) since: Timestamp,
+    /// The target on whose place it was taken up, until the two have been apart.
+    pub(crate) began_on: Option<ImageTrackId>,
+    /// Its box: in this image, if it has been followed into it, or as predicted. `None` for one that
+    /// is not seen, on probation or a candidate.
+    pub(crate) place: Option<PixelBox>,
+}
+
 /// Where the other targets are: what is there is theirs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Others<'a> {
-    /// The boxes of all targets that are seen, in the order of the targets: in this image those
-    /// before the target itself, as predicted those after it. `None` for one that is not seen.
-    pub(crate) boxes: &'a [Option<PixelBox>],
+    /// All targets.
+    pub(crate) all: &'a [KnownPlace],
     /// Index of the target itself.
     pub(crate) own: usize,
+    /// When it was last measured.
+    pub(crate) measured_at: Timestamp,
 }
 
 impl Others<'_> {
-    /// The others' boxes.
+    /// The boxes of the others, without those that may be the target itself: two that were taken up
+    /// on one place, and what was taken up after the target was seen last.
     pub(crate) fn iter(self) -> impl Iterator<Item = PixelBox> {
-        let others = self.boxes.iter().enumerate().filter(move |(index, _)| *index != self.own);
-        others.filter_map(|(_, place)| *place)
+        let own = self.all.get(self.own);
+        self.all.iter().filter_map(move |other| {
+            let own = own.filter(|own| own.id != other.id)?;
+            let are_one = own.began_on == Some(other.id)
+                || other.began_on == Some(own.id)
+                || (own.began_on.is_some() && own.began_on == other.began_on);
+            other.place.filter(|_| !are_one && other.since < self.measured_at)
+        })
+    }
+
+    /// Whether a box has pixels in common with another's.
+    pub(crate) fn overlap(self, place: &PixelBox) -> bool {
+        self.iter().any(|other| other.overlaps(place))
     }
 }
 

@@ -172,8 +172,9 @@ impl TargetBelief {
 const EDGE_PX: f64 = 1.0;
 
 /// Paints over another target's box in a part of an image that begins at `corner`, row by row from
-/// the pixel left of it to that right of it. What is there is not this target's: two that cross
-/// both coast on their velocities until they are apart, and neither goes on as the other.
+/// the pixel left of it to that right of it: what is there is not this target's. Of two that cross
+/// the first is not seen, and coasts on its velocity until they are apart; the other goes on. A box
+/// as wide as the part is left, as nothing beside it says what it hides.
 fn paint_over(part: &mut Plane, corner: [isize; 2], other: &PixelBox) {
     let range = |at: f64, side: f64, corner: isize, all: usize| {
         let [first, end] = [at - EDGE_PX, at + side + EDGE_PX]

@@ -1,6 +1,7 @@
 //! What is learnt of a target from an image: its contrast, size, direction and appearance.
 
 use crate::ImagePoint;
+use crate::features::{FeatureSample, TargetFeatures};
 use crate::fit::{ShapeChange, TargetFit};
 use crate::frame::FrameInput;
 use crate::scratch::Scratch;
@@ -24,7 +25,7 @@ const LEARNING_MATCHES: [f64; 2] = [0.7, 0.95];
 /// Share with which such an image is learned all the same: it may be the target that has changed.
 /// With half of it two of 24 drawn targets that turn from bright to dark within two seconds are
 /// lost; with none six.
-const LEARNT_ANYWAY: f64 = 0.2;
+pub(crate) const LEARNT_ANYWAY: f64 = 0.2;
 /// Averaging time of the usual match, s. With half of it a mast is what usually matches sooner: a
 /// third more of the frames of such scenes are lost; with three times as much a target that turns
 /// is learnt too slowly, and on infrared video twice as many are lost.
@@ -110,6 +111,27 @@ impl TargetBelief {
         self.contrast_variance *= 1.0 - gain;
         let share = (certainty * interval / USUAL_S).min(1.0);
         self.usual_contrast += share * (self.contrast - self.usual_contrast);
+    }
+
+    /// Takes into the features what an image shows of the target, before that is learnt.
+    pub(crate) fn take_features(&mut self, contrast: f64, interval: f64) {
+        let clear = f64::from(self.appearance.clear_share());
+        let expected = self.contrast * clear;
+        // Variance v / E of the measured contrast, as a share of the one expected, squared.
+        let energy = f64::from(self.appearance.energy()).max(1e-12);
+        let variance = f64::from(self.noise) / energy / expected.powi(2);
+        let velocity = self.motion.velocity();
+        self.features
+            .take(FeatureSample { contrast: contrast / expected, variance, velocity }, interval);
+    }
+
+    /// How the target looks and moves. Its contrast is `sqrt(c^2 k E / (n v))`: see
+    /// `correlation_in_noise`.
+    pub(crate) fn features(&self) -> TargetFeatures {
+        let clear = f64::from(self.appearance.clear_share());
+        let own = self.contrast.powi(2) * clear * f64::from(self.appearance.energy());
+        let noise = f64::from(self.appearance.pixels() * self.noise).max(f64::MIN_POSITIVE);
+        self.features.features((own / noise).sqrt())
     }
 
     /// The correlation of a reference with the target's next image if only noise separates them:

@@ -32,6 +32,7 @@ mod coarse;
 mod config;
 mod crop;
 mod detector;
+mod features;
 mod figure;
 mod finding;
 mod fit;
@@ -67,6 +68,7 @@ use std::fmt;
 pub use config::{
     Algorithm, DetectorConfig, GateRule, PaperConfig, TrackerConfig, TrackerConfigError,
 };
+pub use features::TargetFeatures;
 pub use frame::Measurement;
 pub use reference::{ImmConfig, PixelImm, ReferenceStrategy};
 pub use tracker::{ImageTrack, ImageTracker, TrackPhase};
@@ -118,6 +120,12 @@ impl ImagePoint {
 }
 
 impl PixelBox {
+    /// Whether a place is in the box.
+    pub(crate) fn holds(&self, place: ImagePoint) -> bool {
+        (self.x..self.x + self.width).contains(&place.x)
+            && (self.y..self.y + self.height).contains(&place.y)
+    }
+
     /// Whether two boxes have pixels in common.
     pub(crate) fn overlaps(&self, other: &Self) -> bool {
         let (a, b) = (self.centre(), other.centre());

@@ -9,6 +9,7 @@ use crossfix_filter::AxisMeasurement;
 
 use crate::appearance::Appearance;
 use crate::crop::crop;
+use crate::features::FeatureMeter;
 use crate::frame::FrameInput;
 use crate::likelihood::Expectation;
 use crate::motion::ImageMotion;
@@ -55,6 +56,7 @@ pub(crate) struct TargetBelief {
     pub(crate) usual_contrast: f64,
     /// Mean correlation over about a second, as a share of that which noise leaves.
     pub(crate) usual_match: f64,
+    pub(crate) features: FeatureMeter,
     /// Variances of the log scale and of the turn.
     pub(crate) shape_variances: [f64; 2],
     /// Number of images without it since it was last seen, ...
@@ -99,6 +101,7 @@ impl TargetBelief {
             contrast_variance: 0.0,
             usual_contrast: 1.0,
             usual_match: 1.0,
+            features: FeatureMeter::default(),
             shape_variances: CUT_OUT_SHAPE,
             missed: 0,
             unseen_s: 0.0,

@@ -11,10 +11,14 @@ use nalgebra::Matrix2;
 use crate::config::Algorithm;
 use crate::detector::Detector;
 use crate::followed::{Followed, Follower, TakenUpBy, describe};
-use crate::frame::{FrameInput, Measurement, Others};
+use crate::followed_target::LEAST_MOVE_PX;
+use crate::frame::{FrameInput, KnownPlace, Measurement, Others};
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
-use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig, TrackerConfigError, TrackerPart};
+use crate::{
+    ImagePoint, ImageTrackId, PixelBox, TargetFeatures, TrackerConfig, TrackerConfigError,
+    TrackerPart,
+};
 
 /// Longest time between images, s; longer ones are cut to it: after such a pause nothing is known
 /// of a target anyway. With half of it a camera of less than two images per second forgets its
@@ -66,6 +70,8 @@ pub struct ImageTrack {
     /// Normalised innovation squared, summed over both axes: chi-square with two degrees of freedom
     /// if the filters are consistent; absent if nothing was predicted.
     pub nis: Option<f64>,
+    /// How it looks and moves; absent with the papers' algorithm.
+    pub features: Option<TargetFeatures>,
 }
 
 /// A candidate that keeps to its place for this long is dropped, s: a target that can be
@@ -119,8 +125,8 @@ pub struct ImageTracker {
     pub(crate) waiting: Vec<PixelBox>,
     pub(crate) followed: Vec<Followed>,
     pub(crate) tracks: Vec<ImageTrack>,
-    /// Memory for the boxes of [`Others`].
-    boxes: Vec<Option<PixelBox>>,
+    /// Memory for the places of [`Others`].
+    places: Vec<KnownPlace>,
     pub(crate) next_id: u64,
     /// Candidates are numbered down from the largest number; their numbers are never published.
     pub(crate) next_candidate: u64,
@@ -152,7 +158,7 @@ impl ImageTracker {
             waiting: Vec::new(),
             followed: Vec::new(),
             tracks: Vec::new(),
-            boxes: Vec::new(),
+            places: Vec::new(),
             next_id: 1,
             next_candidate: u64::MAX - 1,
             last: None,
@@ -259,8 +265,29 @@ impl ImageTracker {
             .map(|f| f.id)
     }
 
+    /// Notes where each target is expected in the next image, for the others.
+    fn note_places(&mut self, interval: f64, scene_moved: [f64; 2]) {
+        for index in 0..self.followed.len() {
+            let one = &self.followed[index];
+            let other = self.followed.iter().find(|other| Some(other.id) == one.began_on);
+            if !other.is_some_and(|other| are_near(&one.target, &other.target, 0.0)) {
+                self.followed[index].began_on = None;
+            }
+        }
+        // Where the camera has been jerked nobody knows yet whether the targets have moved with it.
+        let is_jerked = scene_moved[0].hypot(scene_moved[1]) >= LEAST_MOVE_PX;
+        self.places.clear();
+        self.places.extend(self.followed.iter().map(|followed| KnownPlace {
+            id: followed.id,
+            since: followed.since,
+            began_on: followed.began_on,
+            place: followed.expected(interval).filter(|_| !is_jerked),
+        }));
+    }
+
     /// Follows all targets into an image, and makes its tracks.
     fn follow(&mut self, image: &Plane, time: Timestamp, interval: f64, scene_moved: [f64; 2]) {
+        self.note_places(interval, scene_moved);
         let turn = self.next_sought();
         let frame = FrameInput {
             image,
@@ -273,11 +300,9 @@ impl ImageTracker {
             config: &self.config,
         };
         self.tracks.clear();
-        self.boxes.clear();
-        self.boxes.extend(self.followed.iter().map(|followed| followed.expected(interval)));
         for (own, followed) in self.followed.iter_mut().enumerate() {
             let may_search = turn == Some(followed.id);
-            let others = Others { boxes: &self.boxes, own };
+            let others = Others { all: &self.places, own, measured_at: followed.measured_at };
             let frame = FrameInput { may_search, others, ..frame };
             if frame.may_search {
                 followed.searched = Some(time);
@@ -286,7 +311,7 @@ impl ImageTracker {
             if step.measured.is_some() {
                 followed.measured_at = time;
             }
-            self.boxes[own] = step.measured.and_then(|_| followed.expected(0.0));
+            self.places[own].place = step.measured.and_then(|_| followed.expected(0.0));
             let phase = match step.measured {
                 Some(_) => TrackPhase::Tracking,
                 None if followed.target.is_lost() => TrackPhase::Searching,
@@ -414,13 +439,16 @@ impl Followed {
 /// twice as much two tracks of one target are shown for longer.
 const PARTED_S: f64 = 0.5;
 
-/// Whether two tracks are of one target: their centres are within half a box, now and in a while.
+/// Whether two tracks are of one target: they lie on each other, now and in a while.
 fn same(one: &Follower, other: &Follower) -> bool {
+    are_near(one, other, 0.0) && are_near(one, other, PARTED_S)
+}
+
+/// Whether the centres of two targets will be within half a box after this time, s.
+pub(crate) fn are_near(one: &Follower, other: &Follower, after: f64) -> bool {
     let (a, b) = (one.position(), other.position());
     let (v, w) = (one.velocity(), other.velocity());
     let ([aw, ah], [bw, bh]) = (one.size(), other.size());
-    [0.0, PARTED_S].into_iter().all(|after| {
-        (a.x - b.x + after * (v.x - w.x)).abs() < aw.max(bw) / 2.0
-            && (a.y - b.y + after * (v.y - w.y)).abs() < ah.max(bh) / 2.0
-    })
+    (a.x - b.x + after * (v.x - w.x)).abs() < aw.max(bw) / 2.0
+        && (a.y - b.y + after * (v.y - w.y)).abs() < ah.max(bh) / 2.0
 }

@@ -8,7 +8,7 @@ use crate::commands::numbers;
 #[derive(Clone, Copy, Debug, Default, clap::Args)]
 pub struct AnchorArg {
     /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
-    /// ellipsoid.
+    /// ellipsoid (or above what the heights of the file read count from).
     #[arg(
         long,
         value_name = "LAT,LON,HEIGHT",

@@ -94,11 +94,11 @@ struct DemoFiles {
     recording: PathBuf,
     picture: PathBuf,
     /// The simulated network cameras, if the demo uses them.
-    streams: Option<Streams>,
+    streams: Option<CameraStreams>,
 }
 
 /// Simulated network cameras: where their streams are served, and the files for that.
-struct Streams {
+struct CameraStreams {
     address: SocketAddr,
     scene: PathBuf,
     /// The recording of the true positions.
@@ -277,9 +277,9 @@ fn open_free_port() -> anyhow::Result<TcpListener> {
 }
 
 /// Network cameras on a port of this machine that is free at present.
-fn free_streams(folder: &Path) -> anyhow::Result<Streams> {
+fn free_streams(folder: &Path) -> anyhow::Result<CameraStreams> {
     let listener = open_free_port()?;
-    Ok(Streams {
+    Ok(CameraStreams {
         address: listener.local_addr()?,
         scene: folder.join("scene.toml"),
         truth: folder.join("truth.mcap"),
@@ -310,7 +310,7 @@ fn write_files(
     scene: &Scene,
     world: &World,
     network: &NetworkConfig,
-    streams: Option<Streams>,
+    streams: Option<CameraStreams>,
 ) -> anyhow::Result<DemoFiles> {
     std::fs::create_dir_all(folder.join("logs"))
         .with_context(|| format!("cannot make {}", folder.display()))?;
@@ -332,7 +332,7 @@ fn write_files(
         let lens = camera.camera().model().intrinsics();
         write(&folder.join(format!("{name}.yaml")), &intrinsics_to_yaml(name.as_str(), lens))?;
         let source = match &files.streams {
-            Some(Streams { address, .. }) => {
+            Some(CameraStreams { address, .. }) => {
                 SourceConfig::Stream(StreamConfig::open_to_all(format!("rtsp://{address}/{name}")))
             }
             None => {

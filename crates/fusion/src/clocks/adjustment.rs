@@ -404,7 +404,7 @@ fn outlier_share(squares: &[f64]) -> f64 {
 /// Residual of a bearing with the target at a place, in units of its noise; `None` if the place
 /// lies behind the camera.
 fn whitened(sight: &WindowBearing, target: Vector3<f64>, scale: f64) -> Option<Vector2<f64>> {
-    let residual = sight.line.tangent_offset(target.into())?;
+    let residual = sight.line.tangent_residual(target.into())?;
     // z <- L^-1 z, where R = L L'.
     (sight.line.covariance * scale).cholesky()?.l().solve_lower_triangular(&residual)
 }
@@ -427,7 +427,7 @@ struct BearingResidual {
 impl BearingResidual {
     /// `None` if the place lies behind the camera.
     fn at(sight: &WindowBearing, target: Vector3<f64>, scale: f64) -> Option<Self> {
-        let residual: Vector2<f64> = sight.line.tangent_offset(target.into())?;
+        let residual: Vector2<f64> = sight.line.tangent_residual(target.into())?;
         let away = target - sight.line.origin.coords;
         let range = away.norm();
         let direction = away / range;

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, DVector, Matrix6};
 
-use super::common_time::{ClockReading, Common, LIARS_SD_S, common_time};
+use super::common_time::{Common, LIARS_SD_S, StatedClock, common_time};
 
 /// Random walk of an offset, s^2/s: an ordinary quartz. With half of it the estimates follow a
 /// clock a little later.
@@ -71,7 +71,7 @@ pub(super) struct Belief {
     epoch: Option<Timestamp>,
     /// Offset and drift of the clocks' common time from what their reported deviations make of it
     /// now: with it the common time does not step when a clock becomes less certain than it was.
-    site: [f64; 2],
+    common_offset: [f64; 2],
     /// The clocks' common time: recomputed whenever the belief about one of them changes, and not
     /// as time goes on, so that nobody's time steps.
     common: Common,
@@ -192,7 +192,7 @@ impl Belief {
             return;
         }
         self.epoch = Some(time);
-        self.site[0] += self.site[1] * dt;
+        self.common_offset[0] += self.common_offset[1] * dt;
         // P <- F P F' + Q, where each offset grows by dt times its drift: of mean and covariance
         // only the rows and columns of offsets change.
         let clocks: Vec<usize> = self.clock_indices().collect();
@@ -300,7 +300,7 @@ impl Belief {
             let now = self.reference_offset_and_drift();
             let others: Vec<usize> = self.clock_indices().collect();
             for i in 0..2 {
-                self.site[i] -= now[i];
+                self.common_offset[i] -= now[i];
                 others.iter().for_each(|&k| self.mean[k + i] += stood[i]);
             }
         }
@@ -310,14 +310,14 @@ impl Belief {
     /// Gives a clock other deviations and forgets all that was learnt of it; returns the offset and
     /// drift believed before (`None` for the reference).
     fn forget(&mut self, camera: &CameraName, [offset_sd, drift_sd]: [f64; 2]) -> Option<[f64; 2]> {
-        let site = self.reference_offset_and_drift();
+        let common_offset = self.reference_offset_and_drift();
         let clock = self.cameras.get_mut(camera)?;
         (clock.prior, clock.drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
         let index = clock.index;
         self.settle();
         // The new deviations change the clocks' shares: keep the common time where it was.
         for (i, stepped) in self.reference_offset_and_drift().into_iter().enumerate() {
-            self.site[i] += site[i] - stepped;
+            self.common_offset[i] += common_offset[i] - stepped;
         }
         let stood = index.map(|index| [self.mean[index], self.mean[index + 1]]);
         self.widen(camera);
@@ -384,7 +384,7 @@ impl Belief {
 
     /// Recomputes each clock's share in the common time, from the offsets now.
     fn settle(&mut self) {
-        let readings = self.cameras.values().map(|clock| ClockReading {
+        let readings = self.cameras.values().map(|clock| StatedClock {
             offset: self.relative(clock, 0, 0.0),
             variance: clock.prior,
         });
@@ -426,7 +426,7 @@ impl Belief {
             let common = self.shares().map(|(clock, share)| share * self.relative(clock, i, 0.0));
             // Common time = sum of share_k x_k, relative to the reference; the reference itself is
             // at minus that.
-            self.site[i] - common.sum::<f64>()
+            self.common_offset[i] - common.sum::<f64>()
         })
     }
 }

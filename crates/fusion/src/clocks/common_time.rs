@@ -22,12 +22,12 @@ const APART: f64 = 0.5;
 
 /// A clock's offset from an arbitrary one of the clocks, s, and its reported variance, s^2.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct ClockReading {
+pub(super) struct StatedClock {
     pub(super) offset: f64,
     pub(super) variance: f64,
 }
 
-impl ClockReading {
+impl StatedClock {
     fn liars_variance(self) -> f64 {
         LIARS_SD_S.powi(2).max(self.variance)
     }
@@ -82,11 +82,11 @@ impl Maximum {
 
 /// Common time of the clocks, with each one's share. Clocks that are right by definition have all
 /// of it.
-pub(super) fn common_time(clocks: &[ClockReading]) -> Common {
+pub(super) fn common_time(clocks: &[StatedClock]) -> Common {
     let right = clocks.iter().filter(|clock| clock.variance <= 0.0).count();
     if right > 0 {
         let share =
-            |clock: &ClockReading| if clock.variance <= 0.0 { 1.0 / right as f64 } else { 0.0 };
+            |clock: &StatedClock| if clock.variance <= 0.0 { 1.0 / right as f64 } else { 0.0 };
         return Common { shares: clocks.iter().map(share).collect(), variance: 0.0 };
     }
     // Ordered by offset and not by the cameras' names: rounding decides nothing.
@@ -103,7 +103,7 @@ pub(super) fn common_time(clocks: &[ClockReading]) -> Common {
 }
 
 /// Climbs from a common offset to the maximum above it.
-fn climb(clocks: &[ClockReading], order: &[usize], start: f64) -> Maximum {
+fn climb(clocks: &[StatedClock], order: &[usize], start: f64) -> Maximum {
     let mut offset = start;
     let (mut shares, mut variance) = (Vec::new(), 0.0);
     for _ in 0..STEPS {
@@ -149,9 +149,9 @@ mod tests {
 
     /// Common offset of clocks of these offsets and deviations, and its standard deviation, s.
     fn common(clocks: &[(f64, f64)]) -> (f64, f64) {
-        let clocks: Vec<ClockReading> = clocks
+        let clocks: Vec<StatedClock> = clocks
             .iter()
-            .map(|(offset, sd)| ClockReading { offset: *offset, variance: sd.powi(2) })
+            .map(|(offset, sd)| StatedClock { offset: *offset, variance: sd.powi(2) })
             .collect();
         let Common { shares, variance } = common_time(&clocks);
         (

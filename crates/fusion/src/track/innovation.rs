@@ -69,7 +69,7 @@ impl FusedTrack {
         line: &SightLine,
     ) -> Option<BearingInnovation> {
         let model = BearingModel::new(line.origin, self.position_at(time))?;
-        Some(BearingInnovation { residual: model.offset(line)?, model })
+        Some(BearingInnovation { residual: model.residual(line)?, model })
     }
 
     /// The innovation's squared Mahalanobis distance; the reported covariance counts by the factor

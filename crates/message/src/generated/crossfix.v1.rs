@@ -82,6 +82,26 @@ pub struct BearingTrack {
     /// Probability that the target is where the bearing shows and nowhere else, 0 to 1; 0 where nobody has said.
     #[prost(double, tag = "14")]
     pub certainty: f64,
+    /// How the target looks and moves, beside its size and speed; unset where nobody has said. By these figures a
+    /// receiver may tell a bird from a drone; the sender does not.
+    #[prost(message, optional, tag = "15")]
+    pub features: ::core::option::Option<TargetFeatures>,
+}
+/// How a target looks and moves in the image.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct TargetFeatures {
+    /// Contrast against what is about it: root mean square over its box, standard deviations of the image's noise.
+    #[prost(double, tag = "1")]
+    pub contrast: f64,
+    /// Standard deviation of the contrast from image to image over about a second, as a share of it, without what the
+    /// noise explains.
+    #[prost(double, tag = "2")]
+    pub flicker: f64,
+    /// Share of the way of about two seconds that lies between its ends: 1 straight on, 0 to and fro.
+    #[prost(double, tag = "3")]
+    pub straightness: f64,
 }
 /// Which of its tracks a camera takes for what it was told to look for. It is no evidence: whose a bearing is the
 /// fusion centre finds by where it points.

@@ -208,7 +208,7 @@ impl RtspSource {
                 let _ = tokio::time::timeout(FAREWELL, sessions.await_teardown()).await;
             });
         }
-        let Connection { stream, stream_id, codec } = connected?;
+        let RtspConnection { stream, stream_id, codec } = connected?;
         let host = HostClock::read();
         Ok(Self {
             runtime,
@@ -399,7 +399,7 @@ fn refusal(options: &RtspOptions, error: &retina::Error) -> VideoError {
 }
 
 /// A stream that plays.
-struct Connection {
+struct RtspConnection {
     stream: Demuxed,
     /// Its number in the session.
     stream_id: usize,
@@ -409,7 +409,7 @@ struct Connection {
 async fn connect(
     options: &RtspOptions,
     sessions: &Arc<SessionGroup>,
-) -> Result<Connection, VideoError> {
+) -> Result<RtspConnection, VideoError> {
     let credentials = options.login.as_ref().map(|login| Credentials {
         username: login.user().to_owned(),
         password: login.password().to_owned(),
@@ -448,7 +448,7 @@ async fn connect(
     session.setup(stream_id, setup).await.map_err(refusal)?;
     let playing = session.play(PlayOptions::default()).await.map_err(refusal)?;
     let stream = playing.demuxed().map_err(refusal)?;
-    Ok(Connection { stream, stream_id, codec })
+    Ok(RtspConnection { stream, stream_id, codec })
 }
 
 impl Drop for RtspSource {

@@ -127,7 +127,8 @@ pub(super) struct Level {
     /// Correlation of an image's changes with the next one's, 0 to 1: 0 for a sensor's noise, 0.9
     /// for compressed video.
     pub(super) persistence: f32,
-    /// Whether too many cells have changed for the scene to be that of the background.
+    /// Whether too many cells have changed, or the scene sways too far, for it to be that of the
+    /// background.
     is_lost: bool,
     /// This image's changes and the last one's at some cells.
     samples: [Vec<f32>; 2],
@@ -320,15 +321,17 @@ impl Level {
         }
         // A scene without texture shows neither its sway nor whether it is another one.
         let is_textured = textured >= LEAST_TEXTURED;
-        self.is_lost = false;
-        if is_textured {
-            let sway = (changes / slopes).clamp(least, most);
-            // A camera that is shaken is believed at once, one that is still only later.
-            let share = 1.0 - (-interval / STILL_AGAIN_S).exp() as f32;
-            self.sway = sway.max(self.sway + share * (sway - self.sway));
-            self.is_lost = self.sway_px() >= 0.99 * f64::from(SWAY_PX[1])
-                || changed as f32 > MOST_CHANGED * textured as f32;
-        }
+        let sway = if is_textured {
+            (changes / slopes).clamp(least, most)
+        } else {
+            (FIRST_SWAY_PX / self.cell as f32).powi(2)
+        };
+        // A camera that is shaken is believed at once, one that is still only later.
+        let share = 1.0 - (-interval / STILL_AGAIN_S).exp() as f32;
+        self.sway = sway.max(self.sway + share * (sway - self.sway));
+        let sways_most = self.sway_px() >= 0.99 * f64::from(SWAY_PX[1]);
+        self.is_lost =
+            is_textured && (sways_most || changed as f32 > MOST_CHANGED * textured as f32);
     }
 
     /// Converts the changes to standard deviations, and learns the background.

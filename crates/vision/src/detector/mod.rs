@@ -45,8 +45,9 @@ const WARM_UP_S: f64 = 0.25;
 const WARM_UP_IMAGES: u32 = 4;
 /// A background that is still being learnt may look like another scene's for this long before it is
 /// begun anew, s: in a clear sky the first image's targets are all of its texture, and as they move
-/// on, that fades from the mean in 0.2 to 0.4 s. With half of it such a swarm is found up to 3 s
-/// later in a quarter of the skies; with nothing at all hardly ever.
+/// on, that fades from the mean in 0.2 to 0.4 s (of 30 images per second; at 2 or fewer it is begun
+/// anew at once). With half of it such a swarm is found up to 3 s later in a quarter of the skies;
+/// with nothing at all hardly ever.
 const MOST_LOST_S: f64 = 0.5;
 /// Fewest plots of a candidate that is found: two always lie on a line, however far apart. With
 /// half of it any two plots of noise that stand out enough are a target.

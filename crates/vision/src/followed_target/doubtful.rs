@@ -15,7 +15,7 @@ use crate::tracker_part::TrackerPart;
 /// Turns of the camera by less than this are within the uncertainty of a target's motion anyway,
 /// px. With half of it small errors of the registration fork the hypotheses too, each at the cost
 /// of a posterior.
-const LEAST_MOVE_PX: f64 = 2.0;
+pub(crate) const LEAST_MOVE_PX: f64 = 2.0;
 
 impl ImageTarget {
     /// Forks the hypotheses if the camera may have turned: then everything in its image has moved,

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 
-use super::{Args, DemoFiles, Ending, PATIENCE, Streams, text};
+use super::{Args, CameraStreams, DemoFiles, Ending, PATIENCE, text};
 
 /// A process of the demo; it is stopped when this value is dropped.
 struct Component {
@@ -113,7 +113,7 @@ impl CameraProcesses {
                 ["agent", "-c", &text(file), "--wait-for-recorder", "--start-at", &begin];
             agents.push(Component::start(name.as_str(), &files.folder, &arguments)?);
         }
-        let Some(Streams { address, scene, truth }) = &files.streams else {
+        let Some(CameraStreams { address, scene, truth }) = &files.streams else {
             return Ok(Self { players: agents, watchers: Vec::new() });
         };
         let (scene, address, truth) = (text(scene), address.to_string(), text(truth));

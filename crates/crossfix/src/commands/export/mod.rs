@@ -106,7 +106,12 @@ fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
     if let (0, Some(times)) = (rows, &args.times) {
         bail!("no track of {} is there at a time of {}", args.recording.display(), times.display());
     }
-    ensure!(rows > 0, "no track of {} was ever sure (see --all)", args.recording.display());
+    ensure!(
+        rows > 0,
+        "no track of {} was ever sure{}",
+        args.recording.display(),
+        if args.all { "" } else { " (see --all)" }
+    );
     draft.keep()?;
     output::line(format!("{rows} rows written to {}", csv.display()));
     Ok(())

@@ -25,11 +25,13 @@ use table::FollowedTable;
 /// Follow targets in a video, without a network.
 ///
 /// The table has a row for each target and frame, and an empty one for a frame without targets:
-/// frame,x,y,w,h,ok,us,id,certainty,sd_x,sd_y,vx,vy. Frames count from 0; x, y, w, h are the top
-/// left corner and the size of the box in pixels; ok is 1 while the target is measured or shortly
-/// predicted; us the microseconds that all targets of the frame took; id the target; certainty the
-/// probability that it is there; sd_x, sd_y the standard deviations of its place in pixels; vx, vy
-/// its velocity in pixels per second.
+/// frame,x,y,w,h,ok,us,id,certainty,sd_x,sd_y,vx,vy,contrast,flicker,straightness. Frames count
+/// from 0; x, y, w, h are the top left corner and the size of the box in pixels; ok is 1 while the
+/// target is measured or shortly predicted; us the microseconds that all targets of the frame took;
+/// id the target; certainty the probability that it is there; sd_x, sd_y the standard deviations of
+/// its place in pixels; vx, vy its velocity in pixels per second; contrast that against its
+/// surroundings in standard deviations of the noise; flicker the share of it that comes and goes;
+/// straightness the share of the last two seconds' way that lies between its ends.
 #[derive(Debug, clap::Args)]
 #[command(after_help = examples(&[
     "crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv",
@@ -133,6 +135,12 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             path.display()
         ));
     }
+    ensure!(
+        counted.with_target > 0,
+        "no target was found in the {} frames of {}",
+        counted.tracked,
+        args.video.display()
+    );
     Ok(())
 }
 
@@ -142,13 +150,15 @@ struct FrameCounts {
     /// Number of its frames, also of those that were skipped.
     length: u64,
     tracked: u64,
+    /// Those of the tracked ones with a target.
+    with_target: u64,
     /// Frames that could not be decoded.
     bad: u64,
 }
 
 impl FrameCounts {
     fn ensure_usable(&self, args: &Args) -> anyhow::Result<()> {
-        let &Self { length, tracked, bad } = self;
+        let &Self { length, tracked, bad, .. } = self;
         let video = args.video.display();
         ensure!(
             length > args.from,
@@ -197,6 +207,7 @@ fn follow(
         let tracks = tracker.step(image, frame.capture.time);
         let microseconds = begun.elapsed().as_secs_f64() * 1e6;
         counted.tracked += 1;
+        counted.with_target += u64::from(!tracks.is_empty());
         table.write(index, tracks, microseconds)?;
         if let Some(picture) = picture {
             picture.show(frame, image, tracks)?;

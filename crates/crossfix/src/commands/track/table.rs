@@ -5,11 +5,27 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use anyhow::Context;
-use crossfix_vision::{ImageTrack, PixelBox, TrackPhase};
+use crossfix_vision::{ImageTrack, PixelBox, TargetFeatures, TrackPhase};
 
 /// Titles of the table's columns, in order; the boxes are in pixels, `us` in microseconds.
-const COLUMNS: [&str; 13] =
-    ["frame", "x", "y", "w", "h", "ok", "us", "id", "certainty", "sd_x", "sd_y", "vx", "vy"];
+const COLUMNS: [&str; 16] = [
+    "frame",
+    "x",
+    "y",
+    "w",
+    "h",
+    "ok",
+    "us",
+    "id",
+    "certainty",
+    "sd_x",
+    "sd_y",
+    "vx",
+    "vy",
+    "contrast",
+    "flicker",
+    "straightness",
+];
 
 pub(super) struct FollowedTable {
     writer: csv::Writer<Box<dyn Write>>,
@@ -62,6 +78,9 @@ fn deviation(track: &ImageTrack, axis: usize) -> String {
 fn row(frame: u64, track: &ImageTrack, microseconds: f64) -> [String; COLUMNS.len()] {
     let place = PixelBox::about(track.position, track.width, track.height);
     let ok = u8::from(track.phase != TrackPhase::Searching);
+    let feature = |of: fn(TargetFeatures) -> f64| {
+        track.features.map_or_else(String::new, |features| format!("{:.3}", of(features)))
+    };
     [
         frame.to_string(),
         format!("{:.3}", place.x),
@@ -76,5 +95,8 @@ fn row(frame: u64, track: &ImageTrack, microseconds: f64) -> [String; COLUMNS.le
         deviation(track, 1),
         format!("{:.2}", track.velocity.x),
         format!("{:.2}", track.velocity.y),
+        feature(|features| features.contrast),
+        feature(|features| features.flicker),
+        feature(|features| features.straightness),
     ]
 }

@@ -6,7 +6,7 @@ use crossfix_message::{CameraName, Timestamp};
 
 use super::{Belief, ClockEntry, MAX_OFFSET_S};
 use crate::clocks::ClockEstimate;
-use crate::clocks::common_time::ClockReading;
+use crate::clocks::common_time::StatedClock;
 
 /// Offset (s) or drift (s/s) of a clock relative to the common time of all clocks.
 #[derive(Clone, Copy, Debug)]
@@ -27,7 +27,7 @@ impl Belief {
         let clock = self.cameras.get(camera)?;
         let ahead = self.ahead(time);
         let [offset, drift] = [0, 1].map(|component| self.absolute(clock, component, ahead));
-        let reported = ClockReading { offset: offset.mean, variance: clock.prior };
+        let reported = StatedClock { offset: offset.mean, variance: clock.prior };
         Some(ClockEstimate {
             offset_s: offset.mean.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
             // No clock is worse known than its report says, as far as the report is believed.
@@ -45,7 +45,7 @@ impl Belief {
         let offset = |clock: &ClockEntry| self.relative(clock, 0, ahead);
         // Relative to the common time an offset is x_k - sum share x + site, as in `absolute`.
         let common = self.shares().map(|(clock, share)| share * offset(clock)).sum::<f64>()
-            - (self.site[0] + self.site[1] * ahead);
+            - (self.common_offset[0] + self.common_offset[1] * ahead);
         self.cameras
             .values()
             .map(|clock| offset(clock) - common)
@@ -60,8 +60,13 @@ impl Belief {
             _ => self.shares().map(|(clock, share)| share.powi(2) * clock.drift_prior).sum(),
         };
         let row = self.absolute_row(clock, component, ahead);
-        let site = if component == 0 { self.site[0] + self.site[1] * ahead } else { self.site[1] };
-        let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum::<f64>() + site;
+        let common_offset = if component == 0 {
+            self.common_offset[0] + self.common_offset[1] * ahead
+        } else {
+            self.common_offset[1]
+        };
+        let mean =
+            row.iter().map(|(&i, weight)| weight * self.mean[i]).sum::<f64>() + common_offset;
         AbsoluteClock { mean, variance: self.variance_of(&row).max(0.0), common }
     }
 

@@ -7,7 +7,7 @@ use crossfix_geometry::{ImageSize, Pixel};
 use nalgebra::Vector2;
 use plotters::prelude::*;
 
-use super::panel::{Chart, FIRST, Failure, PanelText, PlotArea, Ranges, frame, nothing};
+use super::panel::{Chart, FIRST, Failure, PanelArea, PanelText, Ranges, frame, nothing};
 
 /// Number of cells of an image, across and down. With half as many each way, the mean of a cell
 /// would hide how the lens bends within it.
@@ -21,7 +21,7 @@ const ARROW_SHARE: f64 = 0.9;
 
 /// A plot frame for an image, with rows counted downwards.
 fn image<'a, 'b>(
-    area: &'a PlotArea<'b>,
+    area: &'a PanelArea<'b>,
     title: String,
     size: ImageSize,
 ) -> Result<Chart<'a, 'b>, Failure> {
@@ -59,7 +59,7 @@ impl Arrows {
 }
 
 /// The mean of the labels' residuals in each cell: the remaining error of the lens.
-pub fn mean_residuals(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
+pub fn mean_residuals(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(), Failure> {
     let size = camera.camera.model().intrinsics().size;
     let [across, down] = cell_px(size);
     let mut cells: BTreeMap<(usize, usize), (Vector2<f64>, u32)> = BTreeMap::new();
@@ -89,7 +89,7 @@ pub fn mean_residuals(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), 
 pub fn apart(
     comparison: &CameraComparison,
     second: &CalibratedCamera,
-    area: &PlotArea<'_>,
+    area: &PanelArea<'_>,
 ) -> Result<(), Failure> {
     let size = second.camera.model().intrinsics().size;
     let arrow = |ShownPixel { first, second }: &ShownPixel| {
@@ -104,7 +104,7 @@ pub fn apart(
 }
 
 /// Pointing SD of the camera in each cell, mrad; grey where the lens is not known.
-pub fn pointing(camera: &CalibratedCamera, area: &PlotArea<'_>) -> Result<(), Failure> {
+pub fn pointing(camera: &CalibratedCamera, area: &PanelArea<'_>) -> Result<(), Failure> {
     let size = camera.camera.model().intrinsics().size;
     let [across, down] = cell_px(size);
     let title = format!("{}: pointing known to [mrad], at {:.0} m", camera.name, camera.range_m);

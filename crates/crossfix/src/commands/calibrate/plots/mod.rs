@@ -13,7 +13,7 @@ use crossfix_calibration::{
 use crossfix_message::CameraName;
 use plotters::prelude::*;
 
-use panel::{Failure, PlotArea};
+use panel::{Failure, PanelArea};
 
 /// How many panels a sheet has.
 #[derive(Clone, Copy, Debug)]
@@ -38,7 +38,7 @@ pub fn of_flight(result: &FlightResult, folder: &Path) -> anyhow::Result<usize> 
     Ok(result.cameras.len())
 }
 
-fn of_camera(camera: &CameraResult, panels: &[PlotArea<'_>]) -> Result<(), Failure> {
+fn of_camera(camera: &CameraResult, panels: &[PanelArea<'_>]) -> Result<(), Failure> {
     let [over_time, over_image, motion, histogram, correlation, pointing] = panels else {
         return Err("a sheet has six panels".into());
     };
@@ -67,7 +67,7 @@ pub fn of_comparison(
 fn compared(
     camera: &CameraComparison,
     second: &SiteCalibration,
-    panels: &[PlotArea<'_>],
+    panels: &[PanelArea<'_>],
 ) -> Result<(), Failure> {
     let ([apart, pointing], Some(calibrated)) = (panels, second.camera(&camera.name)) else {
         return Err("a sheet of two panels is of a camera that both have".into());
@@ -85,7 +85,7 @@ fn draw(
     folder: &Path,
     camera: &CameraName,
     grid: Grid,
-    panels: impl FnOnce(&[PlotArea<'_>]) -> Result<(), Failure>,
+    panels: impl FnOnce(&[PanelArea<'_>]) -> Result<(), Failure>,
 ) -> anyhow::Result<()> {
     let path = folder.join(format!("{camera}.svg"));
     draw_sheet(&path, grid, panels)
@@ -95,7 +95,7 @@ fn draw(
 fn draw_sheet(
     path: &Path,
     grid: Grid,
-    panels: impl FnOnce(&[PlotArea<'_>]) -> Result<(), Failure>,
+    panels: impl FnOnce(&[PanelArea<'_>]) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
     let size = (PANEL_PX.0 * grid.columns as u32, PANEL_PX.1 * grid.rows as u32);
     let area = SVGBackend::new(path, size).into_drawing_area();

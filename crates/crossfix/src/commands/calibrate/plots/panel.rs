@@ -6,7 +6,7 @@ use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
-pub type PlotArea<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+pub type PanelArea<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 pub type Failure = Box<dyn std::error::Error>;
 pub type Chart<'a, 'b> =
     ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
@@ -36,7 +36,7 @@ pub struct Ranges {
 
 /// A frame with axes and labels.
 pub fn frame<'a, 'b>(
-    area: &'a PlotArea<'b>,
+    area: &'a PanelArea<'b>,
     words: &PanelText<'_>,
     ranges: Ranges,
 ) -> Result<Chart<'a, 'b>, Failure> {
@@ -57,7 +57,7 @@ pub fn frame<'a, 'b>(
 }
 
 /// A panel with no data, and the reason.
-pub fn nothing(area: &PlotArea<'_>, title: &str, why: &str) -> Result<(), Failure> {
+pub fn nothing(area: &PanelArea<'_>, title: &str, why: &str) -> Result<(), Failure> {
     area.draw(&Text::new(title.to_owned(), (60, 12), ("sans-serif", 15)))?;
     area.draw(&Text::new(why.to_owned(), (60, 60), ("sans-serif", 13)))?;
     Ok(())
@@ -90,7 +90,7 @@ pub fn curve(
 }
 
 /// Names of a panel's two series, each in its colour.
-pub fn legend(area: &PlotArea<'_>, names: [&str; 2]) -> Result<(), Failure> {
+pub fn legend(area: &PanelArea<'_>, names: [&str; 2]) -> Result<(), Failure> {
     /// Width of a letter, px.
     const LETTER_PX: usize = 7;
     let mut x = 66;

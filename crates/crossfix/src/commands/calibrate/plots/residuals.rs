@@ -5,8 +5,8 @@ use crossfix_calibration::{CameraResult, FittedLabel};
 use plotters::prelude::*;
 
 use super::panel::{
-    FIRST, Failure, PanelText, PlotArea, Ranges, SECOND, curve, dots, frame, legend, nothing, span,
-    thinned,
+    FIRST, Failure, PanelArea, PanelText, Ranges, SECOND, curve, dots, frame, legend, nothing,
+    span, thinned,
 };
 
 /// Residuals up to this many SDs are shown: larger ones belong to something else, and are counted.
@@ -28,7 +28,7 @@ const LONGEST_LAG_S: f64 = 3.0;
 const LAGS: usize = 40;
 
 /// The residuals of both axes, over the camera's own time.
-pub fn over_time(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
+pub fn over_time(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(), Failure> {
     let shown = SHOWN * camera.noise.sd_px();
     let beyond = camera.fitted.iter().filter(|label| label.beside_px.amax() > shown).count();
     let title = format!("{}: labels beside the way ({beyond} farther off)", camera.name);
@@ -46,7 +46,7 @@ pub fn over_time(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failu
 
 /// Shows clock errors: how far labels lie ahead along the target's motion, in time, beside how far
 /// they lie across it, which no clock error explains.
-pub fn along_and_across(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
+pub fn along_and_across(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(), Failure> {
     let title = "along and across the motion, medians of 3 s".to_owned();
     let along = medians(&camera.fitted, FittedLabel::ahead_s);
     let across = medians(&camera.fitted, FittedLabel::across_s);
@@ -88,7 +88,7 @@ fn median_of(block: &[(f64, f64)]) -> Option<(f64, f64)> {
 
 /// Histogram of the residuals of both axes in SDs, with the normal curve that they are assumed to
 /// follow.
-pub fn histogram(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
+pub fn histogram(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(), Failure> {
     let noise = camera.noise;
     let title = format!("in deviations of {:.2} px, and a normal curve", noise.sd_px());
     let width = 2.0 * SHOWN / BARS as f64;
@@ -115,7 +115,7 @@ pub fn histogram(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failu
 }
 
 /// Autocorrelation of the labels' errors over the time between them, with the fitted noise model.
-pub fn autocorrelation(camera: &CameraResult, area: &PlotArea<'_>) -> Result<(), Failure> {
+pub fn autocorrelation(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(), Failure> {
     let noise = camera.noise;
     let title = format!(
         "two labels err alike: new each time {:.2} px, lasting {:.2} px for {:.2} s",
