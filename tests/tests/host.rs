@@ -181,7 +181,7 @@ fn a_file_that_is_read_again_holds_from_then_on_but_for_what_cannot() {
     let second = calibration(&|said| height_m(said) == 33.0).unwrap();
     assert!(second.valid_from_ns > first.valid_from_ns);
     let says = |words: &str| site.wait_for_line("north.log", words, Duration::from_secs(5));
-    assert!(says("what it says of source holds once the agent is started anew"));
+    assert!(says("what it says of source holds once the agent is started again"));
 
     // A mistake changes nothing.
     site.write("north.toml", "name = \"north\"\nnonsense = 1\n");

@@ -39,7 +39,7 @@ pub struct Clocks {
     pub estimate: bool,
     /// Cameras whose clock is right by definition. Default none.
     pub trusted: Vec<CameraName>,
-    /// Clocks reported to be better than this are taken at their word, s. 1e-9 to 10. Default
+    /// Clocks reported to be better than this are used as reported, s. 1e-9 to 10. Default
     /// 0.001.
     pub least_sd_s: f64,
     /// Standard deviation of a clock's drift, s/s. 1e-12 to 0.1. Default 0.00003: quartzes are
@@ -94,7 +94,7 @@ pub struct Bearings {
     /// 1000-pixel lens.
     pub equal_sd_rad: f64,
     /// What pose and lens leave unmodelled: added in square to each reported standard deviation,
-    /// rad per axis. 0 to 0.1. Default 0: calibrations are taken at their word.
+    /// rad per axis. 0 to 0.1. Default 0: calibrations are used as reported.
     pub systematic_sd_rad: f64,
 }
 

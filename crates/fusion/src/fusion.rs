@@ -87,7 +87,7 @@ pub struct Fusion {
     site_time: SiteTime,
     /// Exposures ordered by capture time less the estimated offset of their camera's clock.
     corrected: ReorderQueue<SaidTime>,
-    /// [`ClockEstimator::changes`] as of these corrections.
+    /// [`ClockEstimator::changes`] at the time of these corrections.
     corrected_by: u64,
     smoothing: Smoothing,
     cueing: Cueing,

@@ -288,7 +288,7 @@ impl<R: Read + Seek> RecordingReader<R> {
 
     /// Reads the channels that a complete file lists again after its messages.
     fn learn_channels(&mut self) -> Result<(), RecordingError> {
-        // The footer: a record of 20 bytes, then the magic.
+        /// The footer: a record of 20 bytes, then the magic, as MCAP defines it.
         const FOOTER_BYTES: u64 = HEAD_BYTES as u64 + 20 + MAGIC.len() as u64;
         let mut footer = [0; FOOTER_BYTES as usize];
         let Some(place) = self.size.checked_sub(FOOTER_BYTES) else {

@@ -20,7 +20,7 @@ const PICTURE_BATCHES: u32 = 4;
 const SEND_BUFFER_BYTES: u32 = 256 << 10;
 /// How long opening a link may take, ms: with a one-way delay of 700 ms two exchanges take three
 /// seconds. A program that waits for a router that does not answer at all can report that within
-/// five seconds.
+/// five seconds. With half of it such slow links are never opened.
 const OPEN_TIMEOUT_MS: u32 = 4000;
 /// A peer that has not been heard for this long counts as gone, ms. With half of it a wireless
 /// link that stalls for two seconds ends the session; with twice as much a peer that is gone counts

@@ -229,7 +229,7 @@ impl Appearance {
         appearance
     }
 
-    /// The same where the image that it was made of was the mean of so many.
+    /// The same where the image that it was made of was a mean of this number of images.
     pub(crate) fn of_images(self, images: f32) -> Self {
         Self { adaptation: self.adaptation.after(images), anchor_images: images, ..self }
     }

@@ -1,6 +1,8 @@
 //! The gate: the part of an image in which a target is looked for, and the posterior over the
 //! placements of its reference there.
 
+use std::ops::Range;
+
 use crossfix_correlation::Plane;
 use crossfix_filter::Gate;
 
@@ -176,16 +178,11 @@ const EDGE_PX: f64 = 1.0;
 /// the first is not seen, and coasts on its velocity until they are apart; the other goes on. A box
 /// as wide as the part is left, as nothing beside it says what it hides.
 fn paint_over(part: &mut Plane, corner: [isize; 2], other: &PixelBox) {
-    let range = |at: f64, side: f64, corner: isize, all: usize| {
-        let [first, end] = [at - EDGE_PX, at + side + EDGE_PX]
-            .map(|edge| (edge.round() as isize - corner).clamp(0, all as isize) as usize);
-        first..end
-    };
-    let columns = range(other.x, other.width, corner[0], part.width());
+    let columns = covered(other.x, other.width, corner[0], part.width());
     if columns.is_empty() || columns.len() == part.width() {
         return;
     }
-    for y in range(other.y, other.height, corner[1], part.height()) {
+    for y in covered(other.y, other.height, corner[1], part.height()) {
         let row = part.row_mut(y);
         let right = row.get(columns.end).copied();
         let left = columns.start.checked_sub(1).map(|x| row[x]).or(right).unwrap_or_default();
@@ -194,6 +191,14 @@ fn paint_over(part: &mut Plane, corner: [isize; 2], other: &PixelBox) {
             *sample = left + (right - left) * (x as f32 + 0.5) / columns.len() as f32;
         }
     }
+}
+
+/// The columns (or rows) of a part of an image that a box from `at` covers with its blurred edge;
+/// the part begins at `corner` and has `all` of them.
+fn covered(at: f64, side: f64, corner: isize, all: usize) -> Range<usize> {
+    let [first, end] = [at - EDGE_PX, at + side + EDGE_PX]
+        .map(|edge| (edge.round() as isize).saturating_sub(corner).clamp(0, all as isize) as usize);
+    first..end
 }
 
 /// Makes placements impossible whose middle lies outside the image.

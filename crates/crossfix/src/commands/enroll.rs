@@ -199,7 +199,7 @@ fn authority(
     }
     ensure!(
         !public.exists(),
-        "{} is there and its key {} is not: enroll where that is, or remove it to begin anew \
+        "{} is there and its key {} is not: enroll where that is, or remove it to begin again \
          with certificates for all",
         public.display(),
         key.display()

@@ -1,7 +1,7 @@
 //! Adjustment of a window: fits the target's trajectory, the clocks and the poses to its bearings
 //! together.
 
-mod loss;
+mod robust;
 mod target;
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 use super::batch_means::BatchMeans;
 use super::curve::{Basis, Curve, CurvePoint, TimedPlace};
 use super::window::WindowBearing;
-use loss::{BearingLoss, Loss, OUTLIER};
+use robust::{BearingCost, OUTLIER, RobustCost};
 use target::{PlaceShift, PlaceShifts, PredictedTarget};
 
 /// Median of a squared distance of two degrees of freedom, 2 ln 2. With half of it cameras would be
@@ -134,10 +134,10 @@ impl<'a> Adjustment<'a> {
     pub(super) fn solve(mut self, density: i32) -> Option<AdjustedCameras> {
         // Huber's loss still draws the far ones in, while all may be far off; the trimmed one, from
         // then on, lets those of other objects go.
-        let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
-        self.rescale(&state, Loss::Huber);
+        let (state, _) = self.descend(self.begin()?, density, RobustCost::Huber)?;
+        self.rescale(&state, RobustCost::Huber);
         let mut best = self.best_density(state, density)?;
-        if self.rescale(&best.state, Loss::Trimmed) {
+        if self.rescale(&best.state, RobustCost::Trimmed) {
             best = self.best_density(best.state, best.density)?;
         }
         let DensityFit { state, density, evidence } = best;
@@ -159,19 +159,19 @@ impl<'a> Adjustment<'a> {
     /// Sets each camera's covariance factor from its residuals: after the first descent, when not
     /// all may fit, from their median; in the end from the mean of those that fit. Returns whether
     /// a factor has changed much.
-    fn rescale(&mut self, state: &WindowState, loss: Loss) -> bool {
+    fn rescale(&mut self, state: &WindowState, loss: RobustCost) -> bool {
         let squares = self.squares(state);
         let mut changed = false;
         for (scale, mut squares) in self.scales.iter_mut().zip(squares) {
-            if loss == Loss::Trimmed {
+            if loss == RobustCost::Trimmed {
                 squares.retain(|squared| *squared <= OUTLIER);
             }
             squares.sort_unstable_by(f64::total_cmp);
             let count = squares.len() as f64;
             let typical = match (loss, squares.get(squares.len() / 2)) {
                 (_, None) => continue,
-                (Loss::Huber, Some(median)) => median / MEDIAN,
-                (Loss::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
+                (RobustCost::Huber, Some(median)) => median / MEDIAN,
+                (RobustCost::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
             };
             // Up to three standard errors (of the median; four of the mean) above 1 are chance for
             // a camera whose covariances are right. The squares hold the factor so far.
@@ -287,7 +287,7 @@ impl<'a> Adjustment<'a> {
     /// Descends with a density of the jerk.
     fn with_evidence(&self, state: WindowState, density: i32) -> Option<DensityFit> {
         let (state, Quadratic { cost, information, .. }) =
-            self.descend(state, density, Loss::Trimmed)?;
+            self.descend(state, density, RobustCost::Trimmed)?;
         // ln det A = 2 sum ln L_ii for A = L L'.
         let factor = information.cholesky()?;
         let log_determinant = 2.0 * factor.l_dirty().diagonal().map(f64::ln).sum();
@@ -308,7 +308,7 @@ impl<'a> Adjustment<'a> {
         &self,
         mut state: WindowState,
         density: i32,
-        loss: Loss,
+        loss: RobustCost,
     ) -> Option<(WindowState, Quadratic)> {
         let mut here = self.quadratic(&state, density, loss);
         let mut damping = FIRST_DAMPING;
@@ -347,7 +347,7 @@ impl<'a> Adjustment<'a> {
         }
     }
 
-    fn quadratic(&self, state: &WindowState, density: i32, loss: Loss) -> Quadratic {
+    fn quadratic(&self, state: &WindowState, density: i32, loss: RobustCost) -> Quadratic {
         let mut quadratic = self.prior_quadratic(state, density);
         for sight in self.sights {
             let target = self.target(sight, state);
@@ -358,7 +358,7 @@ impl<'a> Adjustment<'a> {
                 quadratic.cost += share * loss.of(1e6).cost;
                 continue;
             };
-            let BearingLoss { cost, weight } = loss.of(seen.squared);
+            let BearingCost { cost, weight } = loss.of(seen.squared);
             quadratic.cost += share * cost;
             if weight > 0.0 {
                 quadratic.add(&target, state.coefficients.len(), &seen, share * weight);
@@ -384,7 +384,7 @@ impl<'a> Adjustment<'a> {
     /// Posterior covariance of clocks and poses, and their squared distance from the prior.
     fn posterior(&self, state: &WindowState, density: i32) -> Option<(DMatrix<f64>, f64)> {
         let (points, cameras) = (state.coefficients.len(), state.cameras.len());
-        let information = self.quadratic(state, density, Loss::Trimmed).information;
+        let information = self.quadratic(state, density, RobustCost::Trimmed).information;
         // The cameras' columns of A^-1: their covariance, with the trajectory marginalised.
         let mut unit = DMatrix::zeros(points + cameras, cameras);
         unit.view_mut((points, 0), (cameras, cameras)).fill_with_identity();

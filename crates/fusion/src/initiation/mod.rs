@@ -36,7 +36,7 @@ use hypotheses::Hypotheses;
 use period::Periods;
 
 /// Most lines of one exposure that the initiation uses: time is bounded, whatever a camera reports.
-/// With half of it no track begins with the later ones of so many.
+/// With half of it no track begins with the later ones beyond that.
 const MAX_LINES: usize = 500;
 
 /// A sight line with its name.

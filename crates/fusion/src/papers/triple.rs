@@ -106,7 +106,7 @@ mod tests {
         assert_eq!(solution.observability.weak_axis, None);
         assert!((solution.velocity - velocity).norm() < 1e-8);
         assert!((solution.position - position).norm() < 1e-8);
-        // The reference implementation has 20 for this geometry and these delays.
+        // The independent implementation has 20 for this geometry and these delays.
         assert!(
             (solution.observability.condition_number - 20.0).abs() < 2.0,
             "{:?}",

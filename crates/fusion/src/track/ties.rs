@@ -72,7 +72,7 @@ pub(super) struct Ties {
     pub(super) learnt: LearntTies,
     /// Decay time of the camera's lasting errors, s.
     pub(super) lasting_s: f64,
-    /// Whether the target is visible to the camera, as of its last exposure.
+    /// Whether the target is visible to the camera, by its last exposure.
     pub(super) visibility: Visibility,
     /// Time of its last bearing of the track, ...
     seen: Option<Timestamp>,

@@ -66,7 +66,7 @@ impl Adaptation {
         Self { strategy, filter, images: 1.0, noise }
     }
 
-    /// The same state if `first` was the mean of so many images.
+    /// The same state if `first` was the mean of this number of images.
     pub(crate) fn after(self, images: f32) -> Self {
         Self { images, ..self }
     }

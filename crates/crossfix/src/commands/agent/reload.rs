@@ -67,7 +67,7 @@ impl Agent {
             }
             Ok(waits) => tracing::warn!(
                 "camera `{name}`: {} is read again; what it says of {} holds once the agent is \
-                 started anew",
+                 started again",
                 self.config.display(),
                 waits.join(", ")
             ),
@@ -89,7 +89,7 @@ impl Agent {
         let new_size = camera.model().intrinsics().size;
         anyhow::ensure!(
             new_size == size,
-            "the lens is for {}x{} now and the camera sends {}x{}: start the agent anew",
+            "the lens is for {}x{} now and the camera sends {}x{}: restart the agent",
             new_size.width,
             new_size.height,
             size.width,
@@ -108,7 +108,7 @@ impl Agent {
         let message = file.with_mount(message, camera.pose())?;
         if file.tracker != watch.file.tracker {
             watch.tracker = ImageTracker::new(file.tracker.clone())?;
-            tracing::info!("targets are found anew, by other parameters");
+            tracing::info!("targets are searched for again, by other parameters");
         }
         self.calibration = message.encode();
         self.calibrated = calibrated;

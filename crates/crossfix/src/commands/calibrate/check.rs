@@ -247,7 +247,7 @@ impl WatchedCamera {
         let (verdict, why) = match &seen.watch {
             Some(watch) if let Some(at) = watch.moved_at.filter(|_| seen.has_moved) => (
                 CameraVerdict::Moved,
-                format!("{}, sure at {at}: calibrate it anew", TurnText(&watch.worst)),
+                format!("{}, sure at {at}: calibrate it again", TurnText(&watch.worst)),
             ),
             _ if seen.is_apart() => (
                 CameraVerdict::Apart,

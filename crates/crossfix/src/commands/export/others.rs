@@ -53,7 +53,8 @@ pub struct OtherFormats {
     /// Foxglove and Rerun without Crossfix.
     #[arg(long, value_name = "FILE")]
     foxglove: Option<PathBuf>,
-    /// How often each target's position is written in these formats, times per second of data.
+    /// How often each target's position is written to GeoJSON, KML, CoT, SAPIENT and ASTERIX, times
+    /// per second of data.
     #[arg(long, value_name = "HERTZ", default_value_t = 10.0, value_parser = numbers::outlet_rate)]
     rate_hz: f64,
     #[command(flatten)]

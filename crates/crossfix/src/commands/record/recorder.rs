@@ -18,7 +18,8 @@ use crate::pace::wall_seconds;
 use crate::repeats::Repeats;
 
 /// Most bytes of messages kept until data set the data time: what a site of a hundred cameras
-/// sends without data in minutes. Further ones are recorded with the time of their arrival.
+/// sends without data in minutes. Further ones are recorded with the time of their arrival: with
+/// half of it, after half as long.
 const MOST_EARLY_BYTES: usize = 8 << 20;
 
 /// Decides what to record of each message; uses no clock but the messages' arrival times, and no

@@ -28,7 +28,7 @@ const TURNING_DENSITY: f64 = 3e-4;
 /// ranges over a factor of 150 were equally likely. With half of it (a factor of 12) lines that
 /// cross by chance gain 0.7 in log-likelihood.
 const UNKNOWN_LOG_RANGE_SD: f64 = 2.0;
-/// A camera has lost sight of a direction if the probability of missing it so often by chance is
+/// A camera has lost sight of a direction if the probability of missing it that often by chance is
 /// below exp of this: once in 100 times, which is two exposures of a camera that reports nine of
 /// ten. With half of it a single miss is a loss.
 const LOST: f64 = -4.6;

@@ -9,31 +9,31 @@ const HUBER: f64 = 9.0;
 /// 245).
 pub(super) const OUTLIER: f64 = 22.0;
 
-/// Robust loss: how hard a bearing pulls.
+/// Robust cost: how hard a bearing pulls.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Loss {
+pub(super) enum RobustCost {
     Huber,
     Trimmed,
 }
 
-impl Loss {
+impl RobustCost {
     /// Of a squared distance.
-    pub(super) fn of(self, squared: f64) -> BearingLoss {
+    pub(super) fn of(self, squared: f64) -> BearingCost {
         match self {
             Self::Huber if squared > HUBER => {
                 // rho(q) = 2 sqrt(H q) - H, w = rho' = sqrt(H / q).
                 let cost = 2.0 * (HUBER * squared).sqrt() - HUBER;
-                BearingLoss { cost, weight: (HUBER / squared).sqrt() }
+                BearingCost { cost, weight: (HUBER / squared).sqrt() }
             }
-            Self::Trimmed if squared > OUTLIER => BearingLoss { cost: OUTLIER, weight: 0.0 },
-            _ => BearingLoss { cost: squared, weight: 1.0 },
+            Self::Trimmed if squared > OUTLIER => BearingCost { cost: OUTLIER, weight: 0.0 },
+            _ => BearingCost { cost: squared, weight: 1.0 },
         }
     }
 }
 
 /// The loss of one bearing.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct BearingLoss {
+pub(super) struct BearingCost {
     pub(super) cost: f64,
     /// Derivative of the cost by the squared distance.
     pub(super) weight: f64,
