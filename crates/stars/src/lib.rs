@@ -9,7 +9,7 @@
 //! ```
 //! use crossfix_geometry::{Camera, Distortion, Geodetic, ImageSize, Intrinsics, Pose};
 //! use crossfix_message::Timestamp;
-//! use crossfix_stars::{Observer, Picture, Sky, find_spots};
+//! use crossfix_stars::{Observer, StarPicture, Sky, find_spots};
 //! use nalgebra::Point3;
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -49,7 +49,7 @@
 //!         }
 //!     }
 //! }
-//! let spots = find_spots(&Picture { width: 960, height: 540, brightness: &brightness })?;
+//! let spots = find_spots(&StarPicture { width: 960, height: 540, brightness: &brightness })?;
 //!
 //! let named = sky.identify(&spots, camera.model())?;
 //! assert!(named.len() > spots.len() / 2);

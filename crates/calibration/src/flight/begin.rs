@@ -445,6 +445,12 @@ impl<'a> BeginWith<'a> {
     }
 }
 
+/// The least range uncertainty of the ways to begin with a pair of cameras, which has up to three
+/// poses: pairs are ranked by it.
+fn least_uncertainty(ways: &[BeginWith<'_>]) -> f64 {
+    ways.iter().map(|way| way.range_uncertainty).fold(f64::INFINITY, f64::min)
+}
+
 /// Of the best pairs the one that most cameras fit, and fit best; poses of an earlier calibration
 /// are preferred if they fit about as well.
 fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<BegunFlight, FlightError> {
@@ -458,11 +464,7 @@ fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<BegunFlig
             known.extend(BeginWith::known(both, seen, survey));
         }
     }
-    // A pair of cameras has up to three poses; its least range uncertainty ranks it.
-    let least = |ways: &[BeginWith<'_>]| {
-        ways.iter().map(|p| p.range_uncertainty).fold(f64::INFINITY, f64::min)
-    };
-    found.sort_by(|a, b| least(a).total_cmp(&least(b)));
+    found.sort_by(|a, b| least_uncertainty(a).total_cmp(&least_uncertainty(b)));
     known.sort_by(|a, b| a.range_uncertainty.total_cmp(&b.range_uncertainty));
     let tried = found.into_iter().take(PAIRS_TRIED).flatten();
     let ways = tried.chain(known.into_iter().take(PAIRS_TRIED));

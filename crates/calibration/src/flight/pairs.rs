@@ -10,7 +10,7 @@ use crossfix_geometry::Pose;
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
 use super::model::{CameraLabels, Label, frame_time};
-use super::plane;
+use super::plane::{self, SecondFromFirst};
 use super::start::StartPose;
 use crate::lens;
 
@@ -109,15 +109,6 @@ impl Sights {
     fn timed(&self) -> impl Iterator<Item = (f64, Vector3<f64>)> {
         self.times_s.iter().copied().zip(self.directions.iter().copied())
     }
-}
-
-/// The second camera's frame from the first's: a direction `a` to a place is `R a + t` in the
-/// second's.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct SecondFromFirst {
-    pub(super) rotation: Matrix3<f64>,
-    /// In any unit of length.
-    pub(super) shift: Vector3<f64>,
 }
 
 /// Relative pose and clock offset of two cameras.

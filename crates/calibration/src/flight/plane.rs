@@ -3,7 +3,14 @@
 
 use nalgebra::{Matrix3, SMatrix, Vector3};
 
-use super::pairs::SecondFromFirst;
+/// The second camera's frame from the first's: a direction `a` to a place is `R a + t` in the
+/// second's.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct SecondFromFirst {
+    pub(super) rotation: Matrix3<f64>,
+    /// In any unit of length.
+    pub(super) shift: Vector3<f64>,
+}
 
 /// Eigenvalues nearer together than this are equal: the cameras stand in one place. With half of it
 /// the same.

@@ -40,8 +40,9 @@ pub struct TableRow {
     pub x: f64,
     /// The paper's figure, if it prints one.
     pub paper: Option<f64>,
-    /// An independent reference implementation's figure, if there is one.
-    pub reference: Option<f64>,
+    /// An independent implementation's figure, if there is one.
+    #[serde(rename = "reference")]
+    pub independent: Option<f64>,
     /// The requirement, if there is one.
     pub limit: Option<Limit>,
     /// Our figure.
@@ -74,7 +75,7 @@ impl TableRow {
             series: series.into(),
             x,
             paper: None,
-            reference: None,
+            independent: None,
             limit: None,
             ours,
             standard_error,
@@ -88,10 +89,10 @@ impl TableRow {
         self
     }
 
-    /// With the reference implementation's figure.
+    /// With the independent implementation's figure.
     #[must_use]
-    pub fn reference(mut self, reference: f64) -> Self {
-        self.reference = Some(reference);
+    pub fn independent(mut self, independent: f64) -> Self {
+        self.independent = Some(independent);
         self
     }
 

@@ -2,7 +2,15 @@
 
 use pulp::Arch;
 
-use super::level::{CONTRAST_SPREAD, OUTLYING};
+/// A squared change counts in the learnt mean and variance for at most this many variances: what
+/// passes by is no noise of the place. With half of it flickering leaves take twice as long to be
+/// learnt; without it the first target makes its path blind, and the place where it was before it
+/// was found looks like something that has come.
+pub(super) const OUTLYING: f32 = 16.0;
+/// Standard deviation by which contrasts vary from place to place when the light changes, as a
+/// share of the contrast. With half of it a cloud's shadow changes sharp edges by three standard
+/// deviations.
+const CONTRAST_SPREAD: f32 = 0.03;
 
 /// Squared slope, (levels per cell)^2, by central differences between the neighbours.
 #[inline(always)]

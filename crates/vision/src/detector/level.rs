@@ -3,22 +3,13 @@
 
 use crossfix_correlation::Plane;
 
-use super::cell_update::{BackgroundRow, CellUpdate, slope_squared};
+use super::cell_update::{BackgroundRow, CellUpdate, OUTLYING, slope_squared};
 use super::filter::{SURROUNDINGS, StandOutScratch, between, moved, resample, stand_out};
 use crate::noise::{OF_MEDIAN, median};
 
-/// A squared change counts in the learnt mean and variance for at most this many variances: what
-/// passes by is no noise of the place. With half of it flickering leaves take twice as long to be
-/// learnt; without it the first target makes its path blind, and the place where it was before it
-/// was found looks like something that has come.
-pub(super) const OUTLYING: f32 = 16.0;
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a
 /// level, and with half of it each such step is two standard deviations.
 const LEAST_SPREAD: f32 = 0.5;
-/// Standard deviation by which contrasts vary from place to place when the light changes, as a
-/// share of the contrast. With half of it a cloud's shadow changes sharp edges by three standard
-/// deviations.
-pub(super) const CONTRAST_SPREAD: f32 = 0.03;
 /// Bounds of the sway, px: no scene is stiller than the first, and more than the second is no sway
 /// but another scene. With half of the second a shake of half a pixel loses the background.
 const SWAY_PX: [f32; 2] = [0.05, 1.0];

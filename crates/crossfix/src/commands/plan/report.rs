@@ -162,13 +162,16 @@ fn median(score: &Score) -> Option<f64> {
     (score.fixed > 0.5).then_some(score.median_sd_m)
 }
 
+/// How the site fares with one more camera at a place, or with none.
+fn advice_row(place: String, score: &Score) -> Vec<String> {
+    vec![place, percent(score.fixed), output::number(median(score), 3)]
+}
+
 fn advice_table(report: &PlanReport, advice: &Advice) -> String {
     let head = ["one more camera at [m]", "with a fix", "position SD [m]: 50 % of the volume"];
-    let row = |name: String, score: &Score| {
-        vec![name, percent(score.fixed), output::number(median(score), 3)]
-    };
-    let mut rows = vec![head.map(str::to_owned).to_vec(), row("none".to_owned(), &advice.now)];
-    rows.extend(report.best.iter().map(|best| row(place(best.position_m), &best.score)));
+    let none = advice_row("none".to_owned(), &advice.now);
+    let mut rows = vec![head.map(str::to_owned).to_vec(), none];
+    rows.extend(report.best.iter().map(|best| advice_row(place(best.position_m), &best.score)));
     format!(
         "{}\n(like `{}`, aimed at {}; ground and obstacles are not known)",
         output::table(&rows),

@@ -43,7 +43,7 @@ enum What {
     /// The fusion: detection, degenerate geometries, the Cramer-Rao bound, manoeuvres (Klochko
     /// 2020, Kalinov 2019).
     ///
-    /// Prints each figure with the paper's, a reference implementation's, ours, the Monte Carlo
+    /// Prints each figure with the paper's, an independent implementation's, ours, the Monte Carlo
     /// standard error and, where something is asked of it, pass or fail.
     #[command(
         after_help = examples(&[

@@ -1,6 +1,6 @@
 //! Tables as figures. Series with several values of x are drawn as curves; where each series has
 //! one value, as with camera layouts, it is a row with a point. Our results are points with bars of
-//! one standard error, the paper's figures crosses, and those of a reference implementation
+//! one standard error, the paper's figures crosses, and those of a independent implementation
 //! circles.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -31,8 +31,8 @@ const WIDE: f64 = 50.0;
 const OURS: RGBColor = RGBColor(31, 90, 160);
 /// Colour of the paper's figures.
 const PAPER: RGBColor = RGBColor(200, 70, 20);
-/// Colour of a reference implementation's figures.
-const REFERENCE: RGBColor = RGBColor(30, 130, 60);
+/// Colour of a independent implementation's figures.
+const INDEPENDENT: RGBColor = RGBColor(30, 130, 60);
 
 /// Draws a table into an SVG file.
 pub fn draw(table: &Table, path: &Path) -> anyhow::Result<()> {
@@ -80,9 +80,9 @@ impl PlotAxis {
     }
 }
 
-/// All figures of a table: ours, the paper's and the reference's.
+/// All figures of a table: ours, the paper's and the independent one's.
 fn figures(table: &Table) -> impl Iterator<Item = f64> {
-    table.rows.iter().flat_map(|row| [Some(row.ours), row.paper, row.reference]).flatten()
+    table.rows.iter().flat_map(|row| [Some(row.ours), row.paper, row.independent]).flatten()
 }
 
 /// A sheet with the table's title and, below it, a key to the marks.
@@ -101,7 +101,7 @@ fn sheet<'a>(
     let marks = [
         ("ours", Mark::Ours, true),
         ("paper", Mark::Paper, has(|row| row.paper)),
-        ("reference", Mark::Reference, has(|row| row.reference)),
+        ("reference", Mark::Independent, has(|row| row.independent)),
     ];
     for (name, mark, _) in marks.into_iter().filter(|(.., is_there)| *is_there) {
         mark.draw_at(&area, (x, 8), colour(mark))?;
@@ -116,7 +116,7 @@ fn sheet<'a>(
 enum Mark {
     Ours,
     Paper,
-    Reference,
+    Independent,
 }
 
 impl Mark {
@@ -124,7 +124,7 @@ impl Mark {
         match self {
             Self::Ours => OURS,
             Self::Paper => PAPER,
-            Self::Reference => REFERENCE,
+            Self::Independent => INDEPENDENT,
         }
     }
 
@@ -137,7 +137,7 @@ impl Mark {
         match self {
             Self::Ours => area.draw(&Circle::new(at, 4, colour.filled()))?,
             Self::Paper => area.draw(&Cross::new(at, 4, colour.stroke_width(2)))?,
-            Self::Reference => area.draw(&Circle::new(at, 5, colour.stroke_width(2)))?,
+            Self::Independent => area.draw(&Circle::new(at, 5, colour.stroke_width(2)))?,
         }
         Ok(())
     }
@@ -180,7 +180,7 @@ fn rows(table: &Table, path: &Path) -> Result<(), PlotFailure> {
         let marks = [
             (Some(row.ours), Mark::Ours),
             (row.paper, Mark::Paper),
-            (row.reference, Mark::Reference),
+            (row.independent, Mark::Independent),
         ];
         for (value, mark) in marks.into_iter().filter_map(|(value, mark)| Some((value?, mark))) {
             mark.draw_at(&whole, local(at(value)), mark.colour())?;
@@ -227,8 +227,8 @@ fn curves(table: &Table, path: &Path) -> Result<(), PlotFailure> {
         chart.draw_series(LineSeries::new(ours, colour.stroke_width(2)).point_size(3))?;
         let papers = rows.iter().filter_map(|row| Some(place(row.paper?, row)));
         chart.draw_series(papers.map(|at| Cross::new(at, 5, colour.stroke_width(2))))?;
-        let references = rows.iter().filter_map(|row| Some(place(row.reference?, row)));
-        chart.draw_series(references.map(|at| Circle::new(at, 5, colour.stroke_width(2))))?;
+        let independents = rows.iter().filter_map(|row| Some(place(row.independent?, row)));
+        chart.draw_series(independents.map(|at| Circle::new(at, 5, colour.stroke_width(2))))?;
         let y = (index as u32 * ROW) as i32 + 10;
         legend.draw(&PathElement::new([(10, y), (30, y)], colour.stroke_width(3)))?;
         legend.draw(&Text::new(name, (36, y - 6), ("sans-serif", 12)))?;

@@ -35,15 +35,16 @@ fn short(value: f64) -> String {
 pub fn table(table: &Table) -> String {
     let mut text = format!("\n{}\n", table.title);
     let width = table.rows.iter().map(|row| row.series.len()).max().unwrap_or(0).max(6);
-    let referenced = table.rows.iter().any(|row| row.reference.is_some());
-    let reference = |cell: &str| if referenced { format!("{cell:>9} ") } else { String::new() };
+    let has_independent = table.rows.iter().any(|row| row.independent.is_some());
+    let independent =
+        |cell: &str| if has_independent { format!("{cell:>9} ") } else { String::new() };
     let _ = writeln!(
         text,
         "{:width$} {:>12} {:>9} {}{:>9} {:>8}  {:16} {}",
         "",
         table.x,
         "paper",
-        reference("reference"),
+        independent("reference"),
         "ours",
         "+-",
         "asked",
@@ -61,7 +62,7 @@ pub fn table(table: &Table) -> String {
             row.series,
             short(row.x),
             row.paper.map_or(String::new(), short),
-            reference(&row.reference.map_or(String::new(), short)),
+            independent(&row.independent.map_or(String::new(), short)),
             short(row.ours),
             short(row.standard_error),
             limit(row.limit),

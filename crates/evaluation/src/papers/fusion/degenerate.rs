@@ -10,16 +10,17 @@ use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
 use super::super::table::{Limit, SampleStatistic, Table, TableRow, mean, root_mean_square, share};
 use super::site::{LAYOUTS, PERIODS, PaperSite, StraightTarget, line, tangent_noise};
-use super::{REFERENCE_RUNS, VELOCITY_SD, reference_tolerance};
+use super::{INDEPENDENT_RUNS, VELOCITY_SD, independent_tolerance};
 
 /// Number of runs of a layout for each run of the options. With half of it standard errors are 1.4
 /// times as large.
 const CHEAP: usize = 10;
-/// Standard deviation of the prior on the velocity in the reference's table, m/s. With half of it
-/// the MAP's velocities would have smaller errors than the reference's.
+/// Standard deviation of the prior on the velocity in the independent implementation's table, m/s.
+/// With half of it the MAP's velocities would have smaller errors than the independent
+/// implementation's.
 const PRIOR_SD: f64 = 30.0;
-/// Above this condition number the reference's solver uses the pseudo-inverse. With half of it the
-/// same: a layout's is below 500 or infinite.
+/// Above this condition number the independent implementation's solver uses the pseudo-inverse.
+/// With half of it the same: a layout's is below 500 or infinite.
 const WORST_CONDITION: f64 = 1e9;
 /// Condition number above which a matrix counts as singular. The largest finite one of a layout is
 /// 469, and rounding leaves some 1e16 of an infinite one: half of it gives the same.
@@ -29,12 +30,12 @@ const SINGULAR: f64 = 1e12;
 struct KnownFigures {
     condition: f64,
     degeneracy: Degeneracy,
-    /// `None` where the reference implementation has none.
-    errors: Option<ReferenceErrors>,
+    /// `None` where the independent implementation has none.
+    errors: Option<IndependentErrors>,
 }
 
-/// The reference implementation's root mean squared errors of position, m, and velocity, m/s.
-struct ReferenceErrors {
+/// The independent implementation's root mean squared errors of position, m, and velocity, m/s.
+struct IndependentErrors {
     papers: [f64; 2],
     map: [f64; 2],
 }
@@ -50,30 +51,30 @@ enum Degeneracy {
     OfTimes,
 }
 
-const fn reference(
+const fn independent(
     condition: f64,
     degeneracy: Degeneracy,
     papers: [f64; 2],
     map: [f64; 2],
 ) -> KnownFigures {
-    KnownFigures { condition, degeneracy, errors: Some(ReferenceErrors { papers, map }) }
+    KnownFigures { condition, degeneracy, errors: Some(IndependentErrors { papers, map }) }
 }
 
-/// A layout that the reference implementation does not have: its condition number is `numpy`'s.
-const fn unreferenced(condition: f64, degeneracy: Degeneracy) -> KnownFigures {
+/// A layout that the independent implementation does not have: its condition number is `numpy`'s.
+const fn without_independent(condition: f64, degeneracy: Degeneracy) -> KnownFigures {
     KnownFigures { condition, degeneracy, errors: None }
 }
 
-/// Figures of [`LAYOUTS`], in their order: the reference implementation's.
-const REFERENCES: [KnownFigures; 8] = [
-    reference(20.0, Degeneracy::Regular, [0.27, 2.2], [0.26, 2.1]),
-    reference(202.0, Degeneracy::OfPlace, [1.5, 14.7], [1.3, 12.0]),
-    reference(f64::INFINITY, Degeneracy::OfTimes, [6.5, 32.0], [3.2, 16.0]),
-    reference(f64::INFINITY, Degeneracy::OfTimes, [0.17, 34.0], [0.15, 16.0]),
-    reference(f64::INFINITY, Degeneracy::OfTimes, [0.18, 27.0], [0.12, 26.0]),
-    unreferenced(94.5, Degeneracy::OfPlace),
-    reference(469.0, Degeneracy::OfPlace, [3.1, 118.0], [0.44, 12.0]),
-    reference(f64::INFINITY, Degeneracy::OfPlace, [3.6, 117.0], [0.41, 11.0]),
+/// Figures of [`LAYOUTS`], in their order: the independent implementation's.
+const INDEPENDENT: [KnownFigures; 8] = [
+    independent(20.0, Degeneracy::Regular, [0.27, 2.2], [0.26, 2.1]),
+    independent(202.0, Degeneracy::OfPlace, [1.5, 14.7], [1.3, 12.0]),
+    independent(f64::INFINITY, Degeneracy::OfTimes, [6.5, 32.0], [3.2, 16.0]),
+    independent(f64::INFINITY, Degeneracy::OfTimes, [0.17, 34.0], [0.15, 16.0]),
+    independent(f64::INFINITY, Degeneracy::OfTimes, [0.18, 27.0], [0.12, 26.0]),
+    without_independent(94.5, Degeneracy::OfPlace),
+    independent(469.0, Degeneracy::OfPlace, [3.1, 118.0], [0.44, 12.0]),
+    independent(f64::INFINITY, Degeneracy::OfPlace, [3.6, 117.0], [0.41, 11.0]),
 ];
 
 /// Names of the solvers, in the order of [`answers`].
@@ -221,9 +222,9 @@ fn said(
     rows
 }
 
-/// Requirement on a solver's error. The MAP's must not exceed the reference's. The papers' inverse
-/// must have the same error, as it serves for comparison, except where noise makes a singular
-/// matrix look regular: its error has no finite variance there.
+/// Requirement on a solver's error. The MAP's must not exceed the independent implementation's. The
+/// papers' inverse must have the same error, as it serves for comparison, except where noise makes
+/// a singular matrix look regular: its error has no finite variance there.
 fn asked(solver: usize, degeneracy: Degeneracy, value: f64, tolerance: f64) -> Option<Limit> {
     match (SOLVERS[solver], degeneracy) {
         (name, _) if name == SOLVERS[2] => Some(Limit::AtMost(value + tolerance)),
@@ -236,9 +237,9 @@ fn asked(solver: usize, degeneracy: Degeneracy, value: f64, tolerance: f64) -> O
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let (mut conditions, mut positions, mut velocities, mut says) =
         (vec![], vec![], vec![], vec![]);
-    for (number, (layout, reference)) in LAYOUTS.iter().zip(&REFERENCES).enumerate() {
+    for (number, (layout, independent)) in LAYOUTS.iter().zip(&INDEPENDENT).enumerate() {
         let at = (number + 1) as f64;
-        conditions.push(condition_row(layout, reference, at));
+        conditions.push(condition_row(layout, independent, at));
         let runs = runs::all(CHEAP * options.runs, |index| {
             run(layout, &mut Noise::new(options.seed, index))
         });
@@ -246,7 +247,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             let answered: Vec<&SolverOutcome> =
                 runs.iter().filter_map(|run| run[solver].as_ref()).collect();
             let series = format!("{}: {name}", layout.name);
-            let errors = reference.errors.as_ref();
+            let errors = independent.errors.as_ref();
             let expected = [errors.map(|e| e.papers), None, errors.map(|e| e.map)][solver];
             for (quantity, rows) in [&mut positions, &mut velocities].into_iter().enumerate() {
                 let errors: Vec<f64> =
@@ -255,18 +256,18 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                 let mut row = TableRow::new(&series, at, figure);
                 if let Some(value) = expected.map(|expected| expected[quantity]) {
                     let digit = [0.01, 1.0][quantity];
-                    let tolerance = reference_tolerance(
+                    let tolerance = independent_tolerance(
                         figure.standard_error,
                         errors.len(),
-                        REFERENCE_RUNS,
+                        INDEPENDENT_RUNS,
                         digit,
                     );
-                    row = row.reference(value);
-                    row.limit = asked(solver, reference.degeneracy, value, tolerance);
+                    row = row.independent(value);
+                    row.limit = asked(solver, independent.degeneracy, value, tolerance);
                 }
                 rows.push(row);
             }
-            says.extend(said(&series, at, &answered, reference.degeneracy));
+            says.extend(said(&series, at, &answered, independent.degeneracy));
         }
     }
     let table =
@@ -284,15 +285,16 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     ]
 }
 
-fn condition_row(layout: &PaperSite, reference: &KnownFigures, at: f64) -> TableRow {
+fn condition_row(layout: &PaperSite, independent: &KnownFigures, at: f64) -> TableRow {
     let exact = lines(layout, &StraightTarget::at_rest(Point3::origin()), None);
     let solution =
         exact.and_then(|[first, second, third]| triple([&first, &second, &third], VELOCITY_SD));
     let condition = solution.map_or(f64::NAN, |s| s.observability.condition_number);
     let row = TableRow::new(layout.name, at, SampleStatistic::exact(condition));
-    if reference.condition > SINGULAR {
+    if independent.condition > SINGULAR {
         return row.limit(Limit::AtLeast(SINGULAR));
     }
-    let tolerance = 0.05 * reference.condition;
-    row.reference(reference.condition).limit(Limit::Near { value: reference.condition, tolerance })
+    let tolerance = 0.05 * independent.condition;
+    row.independent(independent.condition)
+        .limit(Limit::Near { value: independent.condition, tolerance })
 }

@@ -2,8 +2,8 @@
 //! targets.
 //!
 //! The paper does not say what the noise of 0.1 m is added to: both readings are here. Nor does it
-//! give velocities, gates or the distance at which a target counts as found: they are the reference
-//! implementation's, except for the spatial gate ([`PAIR_GATE`]).
+//! give velocities, gates or the distance at which a target counts as found: they are the
+//! independent implementation's, except for the spatial gate ([`PAIR_GATE`]).
 
 use crossfix_filter::KinematicState;
 use crossfix_fusion::papers::{Grouping, GroupingRules, PeriodFix, TemporalGate, pair, triple};
@@ -16,13 +16,13 @@ use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
 use super::super::table::{Limit, SampleStatistic, Table, TableRow, deviation, mean, share};
 use super::site::{PERIODS, PaperSite, StraightTarget, line, tangent_noise};
-use super::{REFERENCE_RUNS, reference_tolerance};
+use super::{INDEPENDENT_RUNS, independent_tolerance};
 
 /// Number of runs of a cell for each run of the options: a run takes a tenth of a millisecond. With
 /// half of it standard errors are 1.4 times as large.
 const CHEAP: usize = 10;
-/// A target is found if a group ends within this distance of it, m: the reference implementation's.
-/// With half of it more targets of two receivers would count as missed.
+/// A target is found if a group ends within this distance of it, m: the independent
+/// implementation's. With half of it more targets of two receivers would count as missed.
 const MATCH_GATE: f64 = 4.1;
 /// Noise of each coordinate of the fixes M(i, j), m (Klochko 2020). With half of it
 /// three receivers would have half of the paper's error.
@@ -72,8 +72,8 @@ struct TableColumn {
     targets: usize,
     delays: [f64; 3],
     paper: DetectionFigures,
-    /// The reference implementation's figures, by interpretation.
-    reference: [DetectionFigures; 2],
+    /// The independent implementation's figures, by interpretation.
+    independent: [DetectionFigures; 2],
 }
 
 const fn cell(
@@ -87,10 +87,10 @@ const fn cell(
         [two, three] => (3, [0.0, two, three]),
         _ => (2, [0.0, delays[0], 0.0]),
     };
-    TableColumn { receivers, targets, delays, paper, reference: [on_positions, on_bearings] }
+    TableColumn { receivers, targets, delays, paper, independent: [on_positions, on_bearings] }
 }
 
-/// The columns of tables 1 and 2, with the paper's figures and the reference implementation's.
+/// The columns of tables 1 and 2, with the paper's figures and the independent implementation's.
 const CELLS: [TableColumn; 8] = [
     cell(1, &[0.1], [1.25, 0.89, 1.00], [1.32, 1.01, 0.98], [1.37, 1.02, 0.98]),
     cell(1, &[0.25], [3.10, 2.30, 0.71], [3.20, 2.46, 0.69], [3.35, 2.50, 0.65]),
@@ -291,12 +291,13 @@ fn figures(
     ]
 }
 
-/// How far our probability, with its standard error, may be from the reference's.
-fn probability_tolerance(reference: f64, standard_error: f64) -> f64 {
-    // A probability of 0 or 1 in the reference has no estimated variance: up to a hundredth is
-    // then allowed.
-    let variance = reference * (1.0 - reference) / REFERENCE_RUNS as f64 + standard_error.powi(2);
-    (3.0 * variance.sqrt()).max(3.0 / REFERENCE_RUNS as f64) + 0.005
+/// How far our probability, with its standard error, may be from the independent implementation's.
+fn probability_tolerance(independent: f64, standard_error: f64) -> f64 {
+    // A probability of 0 or 1 in the independent implementation has no estimated variance: up to a
+    // hundredth is then allowed.
+    let variance =
+        independent * (1.0 - independent) / INDEPENDENT_RUNS as f64 + standard_error.powi(2);
+    (3.0 * variance.sqrt()).max(3.0 / INDEPENDENT_RUNS as f64) + 0.005
 }
 
 /// Tables 1 and 2 with both readings.
@@ -307,24 +308,24 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             let receivers = if cell.receivers == 2 { "two" } else { "three" };
             let series =
                 format!("{receivers} receivers, m = {}, {}", cell.targets, interpretation.name());
-            let reference = cell.reference[interpretation as usize];
+            let independent = cell.independent[interpretation as usize];
             for (quantity, SampledFigure { figure, samples }) in
                 figures(options, cell, interpretation).into_iter().enumerate()
             {
-                let Some(&value) = reference.get(quantity) else {
+                let Some(&value) = independent.get(quantity) else {
                     rows[quantity].push(TableRow::new(&series, cell.delays[1], figure));
                     continue;
                 };
                 let tolerance = if quantity == 2 {
                     probability_tolerance(value, figure.standard_error)
                 } else {
-                    let of_reference = REFERENCE_RUNS * cell.targets;
-                    reference_tolerance(figure.standard_error, samples, of_reference, 0.01)
+                    let of_independent = INDEPENDENT_RUNS * cell.targets;
+                    independent_tolerance(figure.standard_error, samples, of_independent, 0.01)
                 };
                 rows[quantity].push(
                     TableRow::new(&series, cell.delays[1], figure)
                         .paper(cell.paper[quantity])
-                        .reference(value)
+                        .independent(value)
                         .limit(Limit::Near { value, tolerance }),
                 );
             }

@@ -276,9 +276,9 @@ const NIS: usize = 6;
 /// Index in [`methods`] of the interacting models.
 const MODELS: usize = 7;
 
-/// The reference's RMS errors on x of the methods in their order, at both noises, on flights that
-/// it does not give; for the paper's windows at 5 m it prints 4.41 to 4.87.
-const REFERENCES: [[Option<f64>; 2]; 8] = [
+/// The independent implementation's RMS errors on x of the methods in their order, at both noises,
+/// on flights that it does not give; for the paper's windows at 5 m it prints 4.41 to 4.87.
+const INDEPENDENT: [[Option<f64>; 2]; 8] = [
     [Some(0.099), None],
     [Some(0.844), None],
     [Some(0.099), Some(3.95)],
@@ -334,8 +334,8 @@ impl NoiseCase {
                 let roots: Vec<f64> =
                     self.results.iter().map(|run| run[index].squares[axis].sqrt()).collect();
                 let series = format!("{}, {label}", method.name());
-                let reference = REFERENCES[index][self.number].filter(|_| axis == 0);
-                rows.push(TableRow { reference, ..self.row(series, root_mean_square(&roots)) });
+                let independent = INDEPENDENT[index][self.number].filter(|_| axis == 0);
+                rows.push(TableRow { independent, ..self.row(series, root_mean_square(&roots)) });
             }
         }
         rows
@@ -347,8 +347,9 @@ impl NoiseCase {
         for (index, method) in self.methods.iter().enumerate() {
             if matches!(method, FilterChoice::Smoothed(_)) {
                 let name = method.name();
-                // "Much better" than a filter without a model of manoeuvres: in the reference twice
-                // or five times as good. Compared with a filter tuned for them it loses (errata).
+                // "Much better" than a filter without a model of manoeuvres: in the independent
+                // implementation twice or five times as good. Compared with a filter tuned for them
+                // it loses (errata).
                 let (low, tuned) = (self.ratio(index, LOW), self.ratio(index, TUNED));
                 let series = format!("{name} over Kalman, low noise");
                 rows.push(self.row(series, low).limit(Limit::AtMost(0.5)));
@@ -392,9 +393,9 @@ impl NoiseCase {
             let delays = self.results.iter().flat_map(|run| &run[index].delays);
             let seen: Vec<f64> = delays.clone().flatten().copied().collect();
             if !seen.is_empty() {
-                let reference = delay_of_reference(method).filter(|_| self.number == 0);
+                let independent = independent_delay(method).filter(|_| self.number == 0);
                 let row = self.row(format!("{name}: frames to the alarm"), mean(&seen));
-                rows.push(TableRow { reference, ..row });
+                rows.push(TableRow { independent, ..row });
             }
             let seen = share(delays.map(Option::is_some));
             rows.push(self.row(format!("{name}: share of turns seen"), seen));
@@ -403,9 +404,9 @@ impl NoiseCase {
     }
 }
 
-/// Frames from a turn to the alarm in the reference, at little noise; it has 2.0 to 2.2 for the
-/// paper's detector.
-fn delay_of_reference(method: &FilterChoice) -> Option<f64> {
+/// Frames from a turn to the alarm in the independent implementation, at little noise; it has 2.0
+/// to 2.2 for the paper's detector.
+fn independent_delay(method: &FilterChoice) -> Option<f64> {
     match method {
         FilterChoice::Smoothed(_) => Some(2.1),
         FilterChoice::Nis(_) => Some(1.0),

@@ -8,12 +8,12 @@ mod site;
 
 use super::Experiment;
 
-/// Standard deviation of each component of the targets' velocities, m/s: the reference
+/// Standard deviation of each component of the targets' velocities, m/s: the independent
 /// implementation's. With half of it true pairs miss each other by half as much.
 const VELOCITY_SD: f64 = 15.6;
-/// Number of runs of the reference implementation behind each of its figures. With half of it the
+/// Number of runs of the independent implementation behind each of its figures. With half of it the
 /// tolerances of the comparison would be wider.
-const REFERENCE_RUNS: usize = 300;
+const INDEPENDENT_RUNS: usize = 300;
 
 /// The fusion's experiments, in the order of their tables.
 pub(super) const EXPERIMENTS: [Experiment; 6] = [
@@ -25,14 +25,14 @@ pub(super) const EXPERIMENTS: [Experiment; 6] = [
     Experiment { name: "manoeuvres (Kalinov 2019, Fig. 11)", make: manoeuvre::tables },
 ];
 
-/// Tolerance on the difference to a reference figure: three standard errors of the difference, with
-/// the reference's runs scattered as ours are over `samples` samples, and half of the reference's
-/// last digit.
-fn reference_tolerance(
+/// Tolerance on the difference to an independent figure: three standard errors of the difference,
+/// with the independent implementation's runs scattered as ours are over `samples` samples, and
+/// half of the independent implementation's last digit.
+fn independent_tolerance(
     standard_error: f64,
     samples: usize,
-    reference_samples: usize,
+    independent_samples: usize,
     digit: f64,
 ) -> f64 {
-    3.0 * standard_error * (1.0 + samples as f64 / reference_samples as f64).sqrt() + digit / 2.0
+    3.0 * standard_error * (1.0 + samples as f64 / independent_samples as f64).sqrt() + digit / 2.0
 }

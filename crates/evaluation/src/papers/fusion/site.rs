@@ -89,9 +89,10 @@ pub(super) struct StraightTarget {
 
 impl StraightTarget {
     /// A random target: uniform within 10 m of the origin on each axis at the middle of the
-    /// periods, with a velocity of [`VELOCITY_SD`]. The reference only says "within 10 m"; drawing
-    /// from a ball, or another middle time, leaves all layouts but the coplanar one unchanged, and
-    /// takes that one farther from the reference's figures.
+    /// periods, with a velocity of [`VELOCITY_SD`]. The independent implementation only says
+    /// "within 10 m"; drawing from a ball, or another middle time, leaves all layouts but the
+    /// coplanar one unchanged, and takes that one farther from the independent implementation's
+    /// figures.
     pub fn random(noise: &mut Noise) -> Self {
         let middle_time = PERIODS as f64 / 2.0;
         let middle = Point3::from(Vector3::from_fn(|_, _| 20.0 * noise.uniform() - 10.0));

@@ -84,6 +84,11 @@ pub fn mean_residuals(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(),
     arrows.draw(&mut image(area, title, size)?, enlarged)
 }
 
+/// A pixel of the first calibration, and the way from there to the second's, px.
+fn to_second(ShownPixel { first, second }: &ShownPixel) -> (Pixel, Vector2<f64>) {
+    (*first, Vector2::new(second.x() - first.x(), second.y() - first.y()))
+}
+
 /// Displacement, at pixels over the image, of a direction between the first and the second
 /// calibration.
 pub fn apart(
@@ -92,10 +97,7 @@ pub fn apart(
     area: &PanelArea<'_>,
 ) -> Result<(), Failure> {
     let size = second.camera.model().intrinsics().size;
-    let arrow = |ShownPixel { first, second }: &ShownPixel| {
-        (*first, Vector2::new(second.x() - first.x(), second.y() - first.y()))
-    };
-    let arrows = Arrows(comparison.pixels.iter().map(arrow).collect());
+    let arrows = Arrows(comparison.pixels.iter().map(to_second).collect());
     let title = format!("{}: from the first to the second", comparison.name);
     let Some(enlarged) = arrows.enlarged(size) else {
         return nothing(area, &title, "no pixel is known to both");
