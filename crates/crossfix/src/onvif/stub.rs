@@ -184,7 +184,7 @@ fn fault(reason: &str) -> String {
     )
 }
 
-fn reply(request: &str, state: &Mutex<State>) -> (&'static str, String) {
+fn reply(request: &str, state: &Mutex<MountMotion>) -> (&'static str, String) {
     let asks = |what: &str| {
         request.contains(&format!(":{what}>")) || request.contains(&format!(":{what}/>"))
     };
