@@ -17,7 +17,9 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
 
+/// Images per second, as most cameras have.
 const RATE_HZ: f64 = 30.0;
+/// Images of a scene: 15 s, in which each target crosses several others.
 const FRAMES: u32 = 450;
 /// Standard deviation of the sensor's noise, levels.
 const NOISE: f64 = 4.0;
@@ -129,7 +131,8 @@ fn a_swarm_over_a_clear_sky_is_found_and_keeps_its_numbers() {
         let outcome = fly(12, [320, 256], seed);
         assert!(outcome.covered > 0.9, "seed {seed}: {outcome:?}");
         assert!(outcome.crossings >= 5, "seed {seed}: {outcome:?}");
-        // Two targets take part in each crossing.
+        // A number in a fifth of the crossings is usual; in half of them each of the two would be
+        // taken for the other as often as not.
         assert!(outcome.renumbered * 3 <= outcome.crossings, "seed {seed}: {outcome:?}");
     }
 }

@@ -92,7 +92,8 @@ pub struct BearingTrack {
 #[serde(default)]
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct TargetFeatures {
-    /// Contrast against what is about it: root mean square over its box, standard deviations of the image's noise.
+    /// Standard deviation of the brightness that it makes in its box and the margin about it, in standard deviations of
+    /// the image's noise.
     #[prost(double, tag = "1")]
     pub contrast: f64,
     /// Standard deviation of the contrast from image to image over about a second, as a share of it, without what the

@@ -22,7 +22,7 @@ mod plots;
 
 use crossfix_correlation::Plane;
 
-use crate::crop::replace_invalid;
+use crate::crop::{paint_over, replace_invalid};
 use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
 use filter::{StandOutScratch, between, halve, stand_out};
@@ -45,8 +45,8 @@ const WARM_UP_S: f64 = 0.25;
 const WARM_UP_IMAGES: u32 = 4;
 /// A background that is still being learnt may look like another scene's for this long before it is
 /// begun anew, s: in a clear sky the first image's targets are all of its texture, and as they move
-/// on, that fades from the mean in 0.2 to 0.4 s (of 30 images per second; at 2 or fewer it is begun
-/// anew at once). With half of it such a swarm is found up to 3 s later in a quarter of the skies;
+/// on, that fades from the mean in 0.2 to 0.4 s (of 30 images per second; below 2 it is begun anew
+/// at once). With half of it such a swarm is found up to 3 s later in a quarter of the skies;
 /// with nothing at all hardly ever.
 const MOST_LOST_S: f64 = 0.5;
 /// Fewest plots of a candidate that is found: two always lie on a line, however far apart. With
@@ -137,12 +137,12 @@ pub(crate) struct Detector {
     sides: [usize; 2],
     levels: Vec<Level>,
     images: u32,
-    age_s: f64,
-    /// Whether the background has been learnt for long enough since it was begun.
-    has_warmed: bool,
-    /// How long another scene was in view while it was learnt, and how long none has been, s.
-    lost_s: f64,
+    /// How long the background has been learnt without another scene in view, s.
     settled_s: f64,
+    /// Whether that has been long enough once since it was begun, ...
+    has_warmed: bool,
+    /// ... and for how long another scene was in view before, s.
+    lost_s: f64,
     plots: Vec<Plot>,
     candidates: Candidates,
     watches: Vec<SceneSuspect>,
@@ -155,10 +155,9 @@ impl Detector {
             sides: [0; 2],
             levels: Vec::new(),
             images: 0,
-            age_s: 0.0,
+            settled_s: 0.0,
             has_warmed: false,
             lost_s: 0.0,
-            settled_s: 0.0,
             plots: Vec::new(),
             candidates: Candidates::default(),
             watches: Vec::new(),
@@ -197,12 +196,12 @@ impl Detector {
             }
             return Findings::default();
         }
-        self.settled_s += interval;
-        let scene = self.take_scene(interval);
-        let is_warm = self.age_s.min(self.settled_s) >= WARM_UP_S && self.images > WARM_UP_IMAGES;
-        if is_warm {
-            (self.has_warmed, self.lost_s) = (true, 0.0);
+        if self.images > 1 {
+            self.settled_s += interval;
         }
+        let scene = self.take_scene(interval);
+        let is_warm = self.settled_s >= WARM_UP_S && self.images > WARM_UP_IMAGES;
+        self.has_warmed |= is_warm;
         let found = if is_warm { self.find(image, interval, turned, known) } else { Vec::new() };
         Findings { found, scene }
     }
@@ -212,8 +211,8 @@ impl Detector {
         for level in &mut self.levels {
             *level = Level::new(level.cell());
         }
-        (self.images, self.age_s) = (0, 0.0);
-        (self.has_warmed, self.lost_s, self.settled_s) = (false, 0.0, 0.0);
+        (self.images, self.settled_s) = (0, 0.0);
+        (self.has_warmed, self.lost_s) = (false, 0.0);
         self.candidates = Candidates::default();
         self.watches.clear();
     }
@@ -264,9 +263,6 @@ impl Detector {
                 known.iter().map(|known| cells_of(level, &known.place)).collect();
             level.see(moment, &covered);
         }
-        if self.images > 0 {
-            self.age_s += interval;
-        }
         self.images = self.images.saturating_add(1);
     }
 
@@ -308,9 +304,7 @@ impl Detector {
             place: outline::outline(image, &candidate.plot),
             gone_px: candidate.gone_px,
         });
-        found
-            .filter(|found| !known.iter().any(|known| overlap(&known.place, &found.place)))
-            .collect()
+        found.filter(|found| !known.iter().any(|known| known.place.is_near(&found.place))).collect()
     }
 }
 
@@ -359,36 +353,14 @@ fn cells_of(level: &Level, place: &PixelBox) -> Cells {
     Cells { columns: range(0), rows: range(1) }
 }
 
-/// Paints over a known target, from the pixels left to those right of it, so that it does not hide
-/// what is about it.
+/// Paints over a known target, so that it does not hide what is about it.
 fn cover(reduced: &mut Plane, place: &PixelBox) {
     let sides = [reduced.width(), reduced.height()];
     let cell = CELLS[0] as f64;
     let [first, last] = covered(place).map(|corner| {
         [0, 1].map(|i| (corner[i] / cell).round().clamp(0.0, sides[i] as f64) as usize)
     });
-    if first[0] >= last[0] {
-        return;
-    }
-    let columns = (last[0] - first[0]) as f32;
-    for y in first[1]..last[1] {
-        let row = reduced.row_mut(y);
-        // At the picture's edge there is one side alone; a box from edge to edge has none.
-        let left = first[0].checked_sub(1).map(|x| row[x]);
-        let Some(left) = left.or(row.get(last[0]).copied()) else { continue };
-        let right = row.get(last[0]).copied().unwrap_or(left);
-        for (x, sample) in row[first[0]..last[0]].iter_mut().enumerate() {
-            // Linear from side to side: a flat patch would have edges, which stand out.
-            *sample = left + (right - left) * (x as f32 + 0.5) / columns;
-        }
-    }
-}
-
-/// Whether two boxes' middles are apart by no more than half the larger side on either axis.
-fn overlap(one: &PixelBox, other: &PixelBox) -> bool {
-    let (a, b) = (one.centre(), other.centre());
-    (a.x - b.x).abs() <= one.width.max(other.width) / 2.0
-        && (a.y - b.y).abs() <= one.height.max(other.height) / 2.0
+    paint_over(reduced, &(first[0]..last[0]), first[1]..last[1]);
 }
 
 /// Whether a plot is within a box's sides of its middle, or within two of its own cells.
