@@ -5,8 +5,8 @@
 mod driver;
 
 libfuzzer_sys::fuzz_target!(
-    // What panics where a stream is opened or received is caught and no finding, so it must not end the
-    // fuzzer; what panics where its frames are made is not caught, and does.
+    // What panics where a stream is opened or received is caught and no finding, so it must not end
+    // the fuzzer; what panics where its frames are made is not caught, and does.
     init: std::panic::set_hook(Box::new(|_| {})),
     |data: &[u8]| {
         driver::drive(data);

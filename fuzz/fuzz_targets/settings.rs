@@ -1,5 +1,6 @@
-//! A fusion centre's, an image tracker's or a scene's file of any text. (A network's and a camera's are tried in
-//! tests of their own crates: Zenoh under a fuzzer takes a quarter of an hour to build.)
+//! A fusion centre's, an image tracker's or a scene's file of any text. (A network's and a camera's
+//! are tried in tests of their own crates: Zenoh under a fuzzer takes a quarter of an hour to
+//! build.)
 #![no_main]
 
 use crossfix_fusion::{Fusion, FusionConfig};

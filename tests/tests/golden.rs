@@ -1,8 +1,8 @@
 //! The tracks of a recording, byte for byte as they were when they were last looked at.
 //!
 //! `tests/golden/two-uavs.csv` has a line each second of `recordings/two-uavs.mcap`: how many track
-//! frames, the digest of their bytes, and where the tracks were. Whoever changes what the fusion makes
-//! of the same bearings sees it here, and writes the file anew when that was meant:
+//! frames, the digest of their bytes, and where the tracks were. Whoever changes what the fusion
+//! makes of the same bearings sees it here, and writes the file anew when that was meant:
 //! `CROSSFIX_GOLDEN=write cargo nextest run -p crossfix-tests --test golden`.
 //!
 //! With `CROSSFIX_GOLDEN=exact` (`.ci/run`) the bytes must be the same. Without it a machine whose

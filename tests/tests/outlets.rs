@@ -318,7 +318,7 @@ fn hear(stream: &mut impl Read, enough: impl Fn(&[u8]) -> bool) -> Vec<u8> {
     heard
 }
 
-/// Waits until a number of Cursor-on-Target events have come.
+/// Number of whole Cursor-on-Target events that have come.
 fn events(heard: &[u8]) -> usize {
     String::from_utf8_lossy(heard).matches("</event>").count()
 }

@@ -20,8 +20,8 @@ use serde::Deserialize;
 const READER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/peers/picture.py");
 /// How long the scene lasts, s.
 const DURATION_S: f64 = 10.0;
-/// No line, point or box is drawn again more often than this, 1/s: what is fewer moves in jerks, and
-/// what is more fills the viewer's memory.
+/// No line, point or box is drawn again more often than this, 1/s: what is fewer moves in jerks,
+/// and what is more fills the viewer's memory.
 const DRAWN_HZ: std::ops::Range<f64> = 5.0..12.0;
 
 #[derive(Debug, Deserialize)]

@@ -9,7 +9,7 @@ use crossfix_message::{CameraName, Channel};
 use crossfix_tests::{PATIENCE, Site};
 use crossfix_transport::{Delivery, Link, LinkPublisher, Role, Subscription};
 
-/// Publishes a number of numbered messages, one per millisecond.
+/// Publishes numbered messages, one per millisecond.
 fn count_aloud(publisher: &LinkPublisher, messages: u32) {
     for number in 0..messages {
         publisher.put(number.to_le_bytes().to_vec()).unwrap();

@@ -27,7 +27,7 @@ struct Traffic {
 }
 
 impl Traffic {
-    /// Frames of every camera of a network, at one rate each.
+    /// Frames of every camera of a network, at the camera's rate.
     fn new(network: &NetworkConfig, site: &Site, rate_hz: f64) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let link = Arc::new(Link::open(network, &Role::Cameras { and_fusion: false }).unwrap());
@@ -144,8 +144,8 @@ fn files_of(folder: &Path) -> Vec<std::path::PathBuf> {
 }
 
 /// A command that is asked to stop half a second after it began to listen for that, and how long it
-/// took from then on.
-fn terminated(arguments: &[&str]) -> (Output, Duration) {
+/// took from then on; `before` is called before it is asked.
+fn terminated(arguments: &[&str], before: impl FnOnce()) -> (Output, Duration) {
     let command = std::process::Command::new(crossfix_tests::program())
         .args(arguments)
         .stdout(std::process::Stdio::piped())
@@ -154,6 +154,7 @@ fn terminated(arguments: &[&str]) -> (Output, Duration) {
         .unwrap();
     wait_until_it_listens(command.id());
     std::thread::sleep(Duration::from_millis(500));
+    before();
     let pid = command.id().to_string();
     std::process::Command::new("kill").args(["-TERM", &pid]).status().unwrap();
     let asked = Instant::now();
@@ -186,7 +187,7 @@ fn a_tracker_that_is_asked_to_stop_keeps_the_rows_so_far() {
     let [video, table] = ["video", "rows.csv"].map(|name| folder.path().join(name));
     let [video_name, table_name] = [&video, &table].map(|path| path.to_str().unwrap());
     let (ended, took) =
-        terminated(&["track", video_name, "--box", "100,100,20,20", "--csv", table_name]);
+        terminated(&["track", video_name, "--box", "100,100,20,20", "--csv", table_name], || ());
     let said = String::from_utf8_lossy(&ended.stderr).into_owned();
     assert!(took < LIMIT && ended.status.success(), "{took:?}: {said}");
     let rows = std::fs::read_to_string(&table).unwrap();
@@ -200,11 +201,16 @@ fn a_tracker_that_is_asked_to_stop_keeps_the_rows_so_far() {
 #[test]
 fn a_command_that_hangs_ends_when_it_is_asked_to_and_leaves_nothing() {
     let folder = tempfile::tempdir().unwrap();
-    let [silent, table] = ["silent.mcap", "rows.csv"].map(|name| folder.path().join(name));
+    let [silent, table] = ["times.csv", "rows.csv"].map(|name| folder.path().join(name));
     // Nobody will ever write to this pipe.
     assert!(std::process::Command::new("mkfifo").arg(&silent).status().unwrap().success());
     let [silent_name, table_name] = [&silent, &table].map(|path| path.to_str().unwrap());
-    let (ended, took) = terminated(&["export", silent_name, "--csv", table_name]);
+    let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/two-uavs.mcap");
+    let export = ["export", recording, "--csv", table_name, "--times", silent_name];
+    let (ended, took) = terminated(&export, || {
+        // The table has been begun.
+        assert_eq!(files_of(folder.path()).len(), 2, "{:?}", files_of(folder.path()));
+    });
     let said = String::from_utf8_lossy(&ended.stderr).into_owned();
     assert!(took < LIMIT, "{took:?}");
     assert_eq!(ended.status.code(), Some(1), "{said}");
@@ -228,7 +234,7 @@ fn a_simulation_that_is_asked_to_stop_leaves_no_half_files() {
         }
         let output = output.to_str().unwrap().to_owned();
         let arguments: Vec<&str> = source.iter().copied().chain([to, &output]).collect();
-        let (ended, took) = terminated(&arguments);
+        let (ended, took) = terminated(&arguments, || ());
         assert!(took < LIMIT, "{to}: {took:?}");
         let said = String::from_utf8_lossy(&ended.stderr).into_owned();
         assert_eq!(ended.status.code(), Some(1), "{to}: {said}");

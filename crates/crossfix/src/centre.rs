@@ -231,7 +231,7 @@ impl Centre {
                 )
             });
         } else {
-            self.repeats.warn(&format!("used again {camera}"), Instant::now(), || {
+            self.repeats.info(&format!("used again {camera}"), Instant::now(), || {
                 format!("camera `{camera}` is used again: its bearings fit the tracks")
             });
         }

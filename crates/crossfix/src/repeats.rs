@@ -33,6 +33,14 @@ impl Repeats {
         }
     }
 
+    /// As [`Self::warn`], for good news. How often it came again is logged with the warnings'
+    /// counts.
+    pub fn info(&mut self, kind: &str, now: Instant, text: impl FnOnce() -> String) {
+        if let Some(line) = self.line(kind, now, text) {
+            tracing::info!("{line}");
+        }
+    }
+
     /// Logs the due counts of warnings that have stopped coming.
     pub fn remind(&mut self, now: Instant) {
         for kind in self.kinds.values_mut() {

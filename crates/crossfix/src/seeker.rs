@@ -27,7 +27,8 @@ const VALID_S: f64 = 2.0;
 /// missed in one image of thirty.
 const GATE: f64 = 13.8;
 /// A track is the target once it has been the likeliest for this many images: one could be chance,
-/// as a bird passes through. Of evidence, not of time: with half of it one image of a bird would do.
+/// as a bird passes through. Of evidence, not of time: with half of it one image of a bird would
+/// do.
 const IMAGES: u32 = 3;
 /// The second-best track's squared distance must be larger by this much: its likelihood is then
 /// twenty times smaller. With half of it 4.5 times would do, and a bird beside the target might be

@@ -38,7 +38,7 @@ pub(crate) enum ExposureArrival {
 
 /// A camera that should be heard: its stream once it has been, and whether it has come to its end.
 #[derive(Clone, Copy, Debug, Default)]
-struct ExpectedCamera {
+struct CameraArrivals {
     stream: Option<FrameStream>,
     ended: bool,
 }
@@ -77,7 +77,7 @@ pub(crate) struct EventBuffer {
     /// What was released within the last `lateness_s`, to tell what comes twice from what comes
     /// late.
     released_keys: BTreeSet<(Timestamp, CameraName)>,
-    sources: BTreeMap<CameraName, ExpectedCamera>,
+    sources: BTreeMap<CameraName, CameraArrivals>,
     /// How far time has gone on, s.
     run_s: f64,
     /// The time that the live cameras agree on, and how many they were, when a frame last came.
@@ -366,7 +366,7 @@ impl EventBuffer {
         let CommonTime { time: agreed, live } = self.agreed?;
         let patience = agreed.plus_seconds(-lateness_s);
         let forgotten = agreed.plus_seconds(-PATIENCES * lateness_s);
-        let is_expected = |source: &ExpectedCamera| source.stream.is_none() && !source.ended;
+        let is_expected = |source: &CameraArrivals| source.stream.is_none() && !source.ended;
         let waits_for_new = self.first.is_some_and(|first| first > forgotten)
             && self.sources.values().any(is_expected);
         // A camera alone is not followed at once: the others may come back, or be heard at last.

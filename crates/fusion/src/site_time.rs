@@ -48,7 +48,7 @@ struct WaitingBounds {
     bearings: usize,
 }
 
-/// See there, also for what breaks with half of them.
+/// The numbers in use; what half of each does is said at its field.
 const BOUNDS: WaitingBounds = WaitingBounds { frames: 200, bearings: 20_000 };
 
 /// A frame as stamped by a clock that is `ahead_s` ahead of its camera's.

@@ -49,7 +49,7 @@ struct ComparedBounds {
     image_tracks: usize,
 }
 
-/// See there, also for what breaks with half of each.
+/// The numbers in use; what half of each does is said at its field.
 const BOUNDS: ComparedBounds = ComparedBounds { lines: 30, image_tracks: 1_000 };
 
 /// Why no target is found.

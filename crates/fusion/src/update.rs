@@ -46,7 +46,7 @@ pub(crate) struct Updated {
     pub(crate) nis: f64,
     /// Logarithm of the bearing's likelihood, 1/sr.
     pub(crate) log_likelihood: f64,
-    pub(crate) told: CrossUpdate,
+    pub(crate) update: CrossUpdate,
 }
 
 /// What a bearing tells of errors outside the state that are correlated with it; for one motion
@@ -96,18 +96,19 @@ impl CrossUpdate {
             moved: Matrix6x2::zeros(),
         };
         let mut state = Vector6::zeros();
-        for ModelUpdate { after: Updated { state: after, told, .. }, probability } in models.clone()
+        for ModelUpdate { after: Updated { state: after, update, .. }, probability } in
+            models.clone()
         {
-            mean.carried += told.carried * probability;
-            mean.gained += told.gained * probability;
-            mean.by += told.by * probability;
-            mean.shifts += told.shifts * probability;
-            mean.weight += told.weight * probability;
-            mean.pull += told.pull * probability;
+            mean.carried += update.carried * probability;
+            mean.gained += update.gained * probability;
+            mean.by += update.by * probability;
+            mean.shifts += update.shifts * probability;
+            mean.weight += update.weight * probability;
+            mean.pull += update.pull * probability;
             state += after.mean * probability;
         }
-        for ModelUpdate { after: Updated { state: after, told, .. }, probability } in models {
-            let pull = told.pull - mean.pull;
+        for ModelUpdate { after: Updated { state: after, update, .. }, probability } in models {
+            let pull = update.pull - mean.pull;
             mean.pull_spread += pull * pull.transpose() * probability;
             mean.moved += (after.mean - state) * pull.transpose() * probability;
         }
@@ -197,7 +198,7 @@ impl Linearised {
             nis,
             // ln N(z; 0, S) in two dimensions: -(z' S^-1 z + ln((2 pi)^2 |S|)) / 2.
             log_likelihood: -(nis + (4.0 * PI.powi(2) * determinant).ln()) / 2.0,
-            told: CrossUpdate {
+            update: CrossUpdate {
                 carried,
                 gained: gain * shifts,
                 by: by * chart.place_by_state(),

@@ -135,7 +135,8 @@ impl SightLine {
         }
     }
 
-    /// Residual of the direction to a point: its part across this ray, on the ray's tangent plane, rad.
+    /// Residual of the direction to a point: its part across this ray, on the ray's tangent plane,
+    /// rad.
     ///
     /// `None` if the point lies at or behind the origin.
     pub fn tangent_residual(&self, point: Point3<f64>) -> Option<Vector2<f64>> {

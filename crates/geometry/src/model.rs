@@ -6,11 +6,11 @@ use crate::{SightLine, tangent_basis};
 /// of that by the place, by the camera's pose and by its clock.
 ///
 /// A bearing is compared with its expectation as a residual on the tangent plane at the expected
-/// direction, measured less expected. The Jacobians say how that residual changes with errors of the
-/// expectation: `residual = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp` is
-/// the true place less the expected one (m, world), `de` the true pose less the stated one (a small
-/// rotation vector about the world's axes, rad, then the position, m) and `dt` the stated capture
-/// time less the true one (s).
+/// direction, measured less expected. The Jacobians say how that residual changes with errors of
+/// the expectation: `residual = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp`
+/// is the true place less the expected one (m, world), `de` the true pose less the stated one (a
+/// small rotation vector about the world's axes, rad, then the position, m) and `dt` the stated
+/// capture time less the true one (s).
 ///
 /// ```
 /// use crossfix_geometry::BearingModel;

@@ -1,4 +1,5 @@
-//! The generated code is that of the definitions; whoever changes `foxglove.proto` writes it anew with
+//! The generated code is that of the definitions; whoever changes `foxglove.proto` writes it anew
+//! with
 //! `CROSSFIX_GENERATE=1 cargo test -p crossfix-outlet --test generated`.
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 

@@ -48,8 +48,8 @@ const WIDE_DEG: f64 = 20.0;
 /// named.
 const LEAST_OVERSAMPLING: f64 = 6.0;
 /// Patterns per part of the sky: with the library's 50 one picture in five was not named where a
-/// fifth of the spots are not stars and a seventh of the stars are hidden; with 400 one in thirty. With half of it it is in
-/// between.
+/// fifth of the spots are not stars and a seventh of the stars are hidden; with 400 one in
+/// thirty; with half of it the share lies between the two.
 const PATTERNS: u32 = 400;
 
 impl Sky {

@@ -253,7 +253,7 @@ impl StreamClock {
         Self { reports, ..Self::new(host, latency, true, ClockMemory::default()) }
     }
 
-    /// The camera says what its clock has `shown` at a stream time.
+    /// The camera says that its clock showed `shown` at a stream time.
     pub(crate) fn report(&mut self, stream_s: f64, shown: Timestamp) {
         if self.heeds_reports {
             self.reports.add(stream_s, shown);

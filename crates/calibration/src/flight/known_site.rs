@@ -18,7 +18,7 @@ pub(super) fn keep_known_site(result: &mut FlightResult, survey: &Survey) {
     if let (Some(datum), Some(known)) = (&mut result.datum, survey.known_datum()) {
         *datum = known.clone();
     }
-    let Some(ClockOffset { ahead_s: later_s, sd_s }) = later(result, survey) else { return };
+    let Some(Lateness { later_s, sd_s }) = later(result, survey) else { return };
     for camera in &mut result.cameras {
         camera.clock.knots.iter_mut().for_each(|knot| knot.ahead_s += later_s);
         camera.fitted.iter_mut().for_each(|label| label.time_s += later_s);
@@ -28,13 +28,20 @@ pub(super) fn keep_known_site(result: &mut FlightResult, survey: &Survey) {
     }
 }
 
+/// How much later the common time is than by an earlier calibration.
+#[derive(Clone, Copy, Debug)]
+struct Lateness {
+    later_s: f64,
+    sd_s: f64,
+}
+
 /// How much later the common time is by the earlier calibration of the clocks: the median of what
 /// the cameras state, as one clock may have been set again. Clocks that no flight has calibrated
 /// are not counted.
-fn later(result: &FlightResult, survey: &Survey) -> Option<ClockOffset> {
-    let mut said: Vec<ClockOffset> =
+fn later(result: &FlightResult, survey: &Survey) -> Option<Lateness> {
+    let mut said: Vec<Lateness> =
         result.cameras.iter().filter_map(|camera| later_by_clock(camera, survey)).collect();
-    said.sort_by(|a, b| a.ahead_s.total_cmp(&b.ahead_s));
+    said.sort_by(|a, b| a.later_s.total_cmp(&b.later_s));
     // Weighted median: the value at which the summed weights 1 / sd^2 reach half of their total.
     let half: f64 = said.iter().map(|one| one.sd_s.powi(-2)).sum::<f64>() / 2.0;
     let mut below = 0.0;
@@ -44,19 +51,19 @@ fn later(result: &FlightResult, survey: &Survey) -> Option<ClockOffset> {
     })?;
     // A median's variance is pi / 2 times a mean's, or more where the cameras differ by more than
     // they state.
-    let deviations = said.iter().map(|one| (one.ahead_s - middle.ahead_s) / one.sd_s);
+    let deviations = said.iter().map(|one| (one.later_s - middle.later_s) / one.sd_s);
     let beside: f64 = deviations.map(|deviations| deviations.abs().min(3.0).powi(2)).sum();
     let spread = (beside / said.len() as f64).max(1.0);
     let sd_s = (std::f64::consts::FRAC_PI_2 * spread / (2.0 * half)).sqrt();
-    Some(ClockOffset { ahead_s: middle.ahead_s, sd_s })
+    Some(Lateness { later_s: middle.later_s, sd_s })
 }
 
 /// The same by the clock of one camera.
-fn later_by_clock(found: &CameraResult, survey: &Survey) -> Option<ClockOffset> {
+fn later_by_clock(found: &CameraResult, survey: &Survey) -> Option<Lateness> {
     let known = survey.known(&found.name)?;
     known.clock.knots_s.first()?;
     let middle = found.clock.knots.get(found.clock.knots.len() / 2)?;
     let ClockOffset { ahead_s, sd_s } = known.clock.at(middle.time_s);
     // Compared in the middle of the flight, where its own rate matters least.
-    Some(ClockOffset { ahead_s: ahead_s - middle.ahead_s, sd_s: sd_s.max(LEAST_CLOCK_SD_S) })
+    Some(Lateness { later_s: ahead_s - middle.ahead_s, sd_s: sd_s.max(LEAST_CLOCK_SD_S) })
 }

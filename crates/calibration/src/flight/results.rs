@@ -259,9 +259,9 @@ impl CameraBlock<'_> {
         let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
         let of_lens = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
         // C(pose) - C(pose, lens) C(lens)^-1 C(lens, pose)
-        let without_lens = pose - &tied * of_lens.cholesky()?.solve(&tied.transpose());
-        let without_lens = (&without_lens + without_lens.transpose()) * 0.5;
-        Some(Matrix6::from_column_slice(without_lens.as_slice()))
+        let given_lens = pose - &tied * of_lens.cholesky()?.solve(&tied.transpose());
+        let given_lens = (&given_lens + given_lens.transpose()) * 0.5;
+        Some(Matrix6::from_column_slice(given_lens.as_slice()))
     }
 }
 

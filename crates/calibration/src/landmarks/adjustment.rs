@@ -58,9 +58,9 @@ impl AdjustedCamera {
         // Regression of the pose on the lens: C(pose, lens) C(lens)^-1.
         let pose_by_lens = lens.clone().cholesky()?.solve(&tied.transpose()).transpose();
         // C(pose | lens) = C(pose) - B C(lens, pose).
-        let without_lens = all.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
-        let without_lens = (&without_lens + without_lens.transpose()) * 0.5;
-        let pose = Matrix6::from_column_slice(without_lens.as_slice());
+        let given_lens = all.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
+        let given_lens = (&given_lens + given_lens.transpose()) * 0.5;
+        let pose = Matrix6::from_column_slice(given_lens.as_slice());
         Some((pose, LensUncertainty { covariance: lens, pose_by_lens }))
     }
 }

@@ -68,14 +68,14 @@ impl AngleScale {
     }
 }
 
-/// The angle at a position from -1 to 1; `ends` are the angles at both.
-fn angle([least, most]: [f64; 2], position: f32) -> f64 {
-    least + (most - least) * (f64::from(position) + 1.0) / 2.0
+/// The angle at a position from -1 to 1, given those at both ends.
+fn angle([first, last]: [f64; 2], position: f32) -> f64 {
+    first + (last - first) * (f64::from(position) + 1.0) / 2.0
 }
 
-/// The position, from -1 to 1, of an angle; the first are the angles at both ends.
-fn position([least, most]: [f64; 2], angle: f64) -> f32 {
-    (2.0 * (angle - least) / (most - least) - 1.0).clamp(-1.0, 1.0) as f32
+/// The position, from -1 to 1, of an angle, given those at both ends.
+fn position([first, last]: [f64; 2], angle: f64) -> f32 {
+    (2.0 * (angle - first) / (last - first) - 1.0).clamp(-1.0, 1.0) as f32
 }
 
 /// An order to a mount to turn.

@@ -84,7 +84,7 @@ impl BearingInformation {
     }
 }
 
-/// Times of the bearings along one line, in seconds from the epoch (negative before it):
+/// Times of the bearings along one line, in seconds from the reference epoch (negative before it):
 /// their number, sum and sum of squares.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TimeOffsets {
@@ -103,9 +103,9 @@ impl FromIterator<f64> for TimeOffsets {
     }
 }
 
-/// Fisher information on a target's position and velocity at an epoch.
+/// Fisher information on a target's position and velocity at a reference epoch.
 ///
-/// A bearing at time `dt` from the epoch, along a line with tangents E and range r, with
+/// A bearing at time `dt` from the reference epoch, along a line with tangents E and range r, with
 /// noise R, adds `H' R^-1 H`, `H = [E'/r, E' dt/r]`. The inverse of the sum is the Cramer-Rao
 /// bound: no unbiased estimator of `[p, v]` has a smaller covariance.
 ///
@@ -137,7 +137,7 @@ impl FisherInformation {
         Self(Matrix6::from_diagonal(&Vector6::new(0.0, 0.0, 0.0, known, known, known)))
     }
 
-    /// Adds a bearing at `dt_s` from the epoch.
+    /// Adds a bearing at `dt_s` from the reference epoch.
     pub fn add(&mut self, line: &LineGeometry, noise: &BearingInformation, dt_s: f64) {
         self.add_all(line, noise, &[dt_s].into_iter().collect());
     }
@@ -250,7 +250,7 @@ pub struct CameraInformation {
 }
 
 impl CameraInformation {
-    /// Adds a bearing at `dt_s` from the epoch.
+    /// Adds a bearing at `dt_s` from the reference epoch.
     pub fn add(&mut self, line: &LineGeometry, noise: &BearingInformation, dt_s: f64) {
         self.add_all(line, noise, &[dt_s].into_iter().collect());
     }

@@ -243,7 +243,8 @@ pub fn smallest_target(
     sizes.get(1).copied()
 }
 
-/// What spans this number of pixels at a point, m; `None` if the camera does not have it in its image.
+/// What spans this number of pixels at a point, m; `None` if the camera does not have it in its
+/// image.
 fn size_of(pixels: f64, camera: &Camera, point: Point3<f64>) -> Option<f64> {
     let lens = camera.model().intrinsics();
     let range = (point - camera.pose().position()).norm();

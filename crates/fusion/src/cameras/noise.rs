@@ -21,7 +21,7 @@ use crate::uncertainty::CorrelatedNoise;
 const MEDIAN: f64 = 2.0 * LN_2;
 /// Increase of the share of draws below the median per unit of the logarithm of the scale: that
 /// distribution's density there. With half of it each step of the estimate is twice as long, and
-/// the estimate twice as noisy.
+/// its error 1.4 times as large.
 const SLOPE: f64 = LN_2 / 2.0;
 /// Number of draws that the estimate remembers: it is then known to 13 %. With half as many a
 /// camera must report a third of its variance before that is noticed, and not half of it.

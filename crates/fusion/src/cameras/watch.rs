@@ -41,10 +41,10 @@ const LEAST_SHIFT_M: f64 = 2e-3;
 /// lines count a quarter less.
 const FREEDOM: f64 = 4.0;
 /// A camera is said to have been moved if the lines are this many times (logarithm) more likely by
-/// it: a thousand times, as one of a site's is moved about once in a thousand minutes, a day. Of the
-/// 62 ways of taking two, three, four or six cameras of the real flights, two name one that stands
-/// where it stood. With clocks declared exact that were off by up to a tenth of a second, 39 did.
-/// With half of it 30 times would do, against odds of a thousand.
+/// it: a thousand times, as one of a site's is moved about once in a thousand minutes, a day. Of
+/// the 62 ways of taking two, three, four or six cameras of the real flights, two name one that
+/// stands where it stood. With clocks declared exact that were off by up to a tenth of a second, 39
+/// did. With half of it 30 times would do, against odds of a thousand.
 const SURE: f64 = 6.9;
 /// Another camera may have been moved in its place unless that is less likely by more than this
 /// (logarithm): one in a hundred. With half of it one that is ten times less likely is cleared.

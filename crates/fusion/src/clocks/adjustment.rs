@@ -13,7 +13,7 @@ use robust::{BearingCost, OUTLIER, RobustCost};
 use target::{PlaceShift, PlaceShifts, PredictedTarget};
 
 /// Median of a squared distance of two degrees of freedom, 2 ln 2. With half of it cameras would be
-/// taken to be twice as noisy as they are.
+/// taken to have twice the variance that they have.
 const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
 /// Largest factor on a camera's covariances: larger residuals are due to a mistake, not to noise,
 /// and are not made likely by taking them for noise. With half of it a camera that reports a third
@@ -132,7 +132,7 @@ impl<'a> Adjustment<'a> {
     /// Fits trajectory, clocks and poses; `None` if the numbers fail. Evidences compare for equal
     /// weights.
     pub(super) fn solve(mut self, density: i32) -> Option<AdjustedCameras> {
-        // Huber's loss still draws the far ones in, while all may be far off; the trimmed one, from
+        // Huber's cost still draws the far ones in, while all may be far off; the trimmed one, from
         // then on, lets those of other objects go.
         let (state, _) = self.descend(self.begin()?, density, RobustCost::Huber)?;
         self.rescale(&state, RobustCost::Huber);
@@ -159,16 +159,16 @@ impl<'a> Adjustment<'a> {
     /// Sets each camera's covariance factor from its residuals: after the first descent, when not
     /// all may fit, from their median; in the end from the mean of those that fit. Returns whether
     /// a factor has changed much.
-    fn rescale(&mut self, state: &WindowState, loss: RobustCost) -> bool {
+    fn rescale(&mut self, state: &WindowState, cost: RobustCost) -> bool {
         let squares = self.squares(state);
         let mut changed = false;
         for (scale, mut squares) in self.scales.iter_mut().zip(squares) {
-            if loss == RobustCost::Trimmed {
+            if cost == RobustCost::Trimmed {
                 squares.retain(|squared| *squared <= OUTLIER);
             }
             squares.sort_unstable_by(f64::total_cmp);
             let count = squares.len() as f64;
-            let typical = match (loss, squares.get(squares.len() / 2)) {
+            let typical = match (cost, squares.get(squares.len() / 2)) {
                 (_, None) => continue,
                 (RobustCost::Huber, Some(median)) => median / MEDIAN,
                 (RobustCost::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
@@ -308,9 +308,9 @@ impl<'a> Adjustment<'a> {
         &self,
         mut state: WindowState,
         density: i32,
-        loss: RobustCost,
+        cost: RobustCost,
     ) -> Option<(WindowState, Quadratic)> {
-        let mut here = self.quadratic(&state, density, loss);
+        let mut here = self.quadratic(&state, density, cost);
         let mut damping = FIRST_DAMPING;
         for _ in 0..MAX_ROUNDS {
             // (A + lambda diag A) step = gradient.
@@ -320,7 +320,7 @@ impl<'a> Adjustment<'a> {
             }
             let next =
                 damped.cholesky().map(|factor| self.moved(&state, &factor.solve(&here.gradient)));
-            let there = next.as_ref().map(|next| self.quadratic(next, density, loss));
+            let there = next.as_ref().map(|next| self.quadratic(next, density, cost));
             match (next, there) {
                 (Some(next), Some(there)) if there.cost < here.cost => {
                     let gained = here.cost - there.cost;
@@ -347,7 +347,7 @@ impl<'a> Adjustment<'a> {
         }
     }
 
-    fn quadratic(&self, state: &WindowState, density: i32, loss: RobustCost) -> Quadratic {
+    fn quadratic(&self, state: &WindowState, density: i32, robust: RobustCost) -> Quadratic {
         let mut quadratic = self.prior_quadratic(state, density);
         for sight in self.sights {
             let target = self.target(sight, state);
@@ -355,10 +355,10 @@ impl<'a> Adjustment<'a> {
             let Some(seen) = BearingResidual::at(sight, target.place, self.scales[sight.camera])
             else {
                 // Behind the camera: as far off as can be.
-                quadratic.cost += share * loss.of(1e6).cost;
+                quadratic.cost += share * robust.of(1e6).cost;
                 continue;
             };
-            let BearingCost { cost, weight } = loss.of(seen.squared);
+            let BearingCost { cost, weight } = robust.of(seen.squared);
             quadratic.cost += share * cost;
             if weight > 0.0 {
                 quadratic.add(&target, state.coefficients.len(), &seen, share * weight);

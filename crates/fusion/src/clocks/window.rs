@@ -27,7 +27,7 @@ struct WindowBounds {
     span_s: f64,
 }
 
-/// See there, also for what breaks with half of each.
+/// The numbers in use; what half of each does is said at its field.
 const BOUNDS: WindowBounds = WindowBounds { bearings: 1500, cameras: 8, anchors: 4, span_s: 30.0 };
 /// After this all cameras to be estimated that see the target have been heard, s. With half of it
 /// an anchor may take the place of one of two frames per second.

@@ -15,7 +15,7 @@ struct QueueBounds {
     sightings: usize,
 }
 
-/// See there, also for what breaks with half of each.
+/// The numbers in use; what half of each does is said at its field.
 const BOUNDS: QueueBounds = QueueBounds { exposures: 6_000, sightings: 100_000 };
 
 /// Key by which exposures are ordered: two of a camera may be corrected to the same time, and the
@@ -35,7 +35,7 @@ struct QueueKey {
 ///                              ^
 ///          insert              |  nothing can come before it, or more wait than may
 ///   new  ---------->  waiting -+
-///    |                         |  the order starts again    
+///    |                         |  the order starts again
 ///    | the same waits already  v
 ///    v                      drained
 ///  refused

@@ -37,7 +37,7 @@ struct HypothesisBounds {
     hypotheses: usize,
 }
 
-/// See there, also for what breaks with half of each.
+/// The numbers in use; what half of each does is said at its field.
 const BOUNDS: HypothesisBounds =
     HypothesisBounds { branches: 3, of_tree: 100, duplicates: 20, hypotheses: 6_000 };
 

@@ -32,7 +32,7 @@ struct SeedBounds {
     kept: usize,
 }
 
-/// See there, also for what breaks with half of each.
+/// The numbers in use; what half of each does is said at its field.
 const BOUNDS: SeedBounds =
     SeedBounds { branches: 5, close_pairs: 20_000, found: 20_000, kept: 2_000 };
 

@@ -74,8 +74,8 @@ impl TrackLikeness {
         self.distance < UNLIKE && self.cost < -2.0 * by_chance.ln()
     }
 
-    /// Whether this pair is of late, and not clearly less likely than another of which only one can
-    /// be of one target.
+    /// Whether this pair is recent and not clearly less likely than another, where only one of the
+    /// two can be of one target.
     fn rivals(&self, other: &Self, now: Timestamp) -> bool {
         // Costs are -2 ln L: a rival is one that is not less likely by the factor `CLEARLY`.
         self.is_of_late(now) && self.cost < other.cost + 2.0 * CLEARLY.ln()

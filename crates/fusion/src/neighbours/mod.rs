@@ -1,5 +1,5 @@
 //! A site that is too large for one fusion centre has several, each for an area. Cameras that see
-//! into two areas are received by both centres, so a target that flies from one area into the other
+//! into two areas are used by both centres, so a target that flies from one area into the other
 //! has for a while a track in each. This module makes them one target for everybody else: both
 //! tracks have the number of the elder, and one of the two centres says (publishes) it.
 //!

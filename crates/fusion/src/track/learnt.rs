@@ -221,14 +221,14 @@ impl FusedTrack {
 
     /// Updates the ties to all cameras' errors with a bearing of one camera, and the estimates of
     /// the lasting errors.
-    pub(super) fn learn(&mut self, camera: &CameraName, told: &CrossUpdate) {
+    pub(super) fn learn(&mut self, camera: &CameraName, update: &CrossUpdate) {
         if self.learnt.is_empty() {
             // Without learnt errors no camera's errors are correlated with another's:
             // X <- (I - K H) X, and for the bearing's own camera X <- (I - K H) X - K J.
             for (name, ties) in &mut self.ties {
-                ties.covariance = told.carried * ties.covariance;
+                ties.covariance = update.carried * ties.covariance;
                 if name == camera {
-                    ties.covariance -= told.gained;
+                    ties.covariance -= update.gained;
                 }
             }
             return;
@@ -236,19 +236,19 @@ impl FusedTrack {
         // A = cov(e, bearing). Means: e += A S^-1 z. Covariances: the usual gain A S^-1, less the
         // spread of S^-1 z over the models where a covariance between estimated quantities is
         // reduced.
-        let across = self.across(camera, told);
-        let gain = &across * told.weight;
-        let known = &across * (told.weight - told.pull_spread);
+        let across = self.across(camera, update);
+        let gain = &across * update.weight;
+        let known = &across * (update.weight - update.pull_spread);
         let between: Vec<SharedCovariance> =
             self.ties.keys().map(|other| self.between(camera, other)).collect();
         for (mean, row) in self.learnt.means.iter_mut().zip((0..).step_by(2)) {
-            *mean += across.fixed_rows::<2>(row) * told.pull;
+            *mean += across.fixed_rows::<2>(row) * update.pull;
         }
         for ((name, ties), between) in self.ties.iter_mut().zip(&between) {
             // cov(bearing, s_k) = H X_k + J cov(s, s_k)
             // X_k <- (I - K H) X_k - K J cov(s, s_k)
-            let seen = told.by * ties.covariance + told.shifts * between;
-            ties.covariance = told.carried * ties.covariance - told.gained * between;
+            let seen = update.by * ties.covariance + update.shifts * between;
+            ties.covariance = update.carried * ties.covariance - update.gained * between;
             match self.learnt.row_of(name) {
                 None => ties.learnt -= &gain * seen,
                 Some(row) => {
@@ -260,7 +260,7 @@ impl FusedTrack {
                     let mut lasting = ties.learnt.fixed_columns_mut::<2>(LASTING);
                     lasting -= &known * own;
                     let mut tied = ties.covariance.fixed_columns_mut::<2>(LASTING);
-                    tied += told.moved * own;
+                    tied += update.moved * own;
                 }
             }
         }
@@ -280,16 +280,16 @@ impl FusedTrack {
     }
 
     /// Covariance A of the learnt errors with a bearing of a camera: A = L J' + X' H'.
-    fn across(&self, camera: &CameraName, told: &CrossUpdate) -> OMatrix<f64, Dyn, U2> {
+    fn across(&self, camera: &CameraName, update: &CrossUpdate) -> OMatrix<f64, Dyn, U2> {
         let Some(own) = self.ties.get(camera) else {
             return OMatrix::<f64, Dyn, U2>::zeros(self.learnt.count());
         };
-        let mut across = &own.learnt * told.shifts.transpose();
+        let mut across = &own.learnt * update.shifts.transpose();
         for (row, name) in self.learnt.rows() {
             if let Some(ties) = self.ties.get(name) {
                 let tied = ties.covariance.fixed_columns::<2>(LASTING);
                 let mut rows = across.fixed_rows_mut::<2>(row);
-                rows += tied.transpose() * told.by.transpose();
+                rows += tied.transpose() * update.by.transpose();
             }
         }
         across

@@ -58,15 +58,15 @@ impl PastState {
     fn learn(
         &mut self,
         camera: &CameraName,
-        told: &CrossUpdate,
+        update: &CrossUpdate,
         seen: &[BearingErrorCovariance<'_>],
     ) {
         let own = *self.ties_to(camera);
         // A = cov(past, bearing) = N' H' + X J', with N = `with_now` and X the ties to the
         // bearing's camera. Mean += A S^-1 z; covariance -= A (S^-1 - spread over the models) A'.
         let across: Matrix6x2<f64> =
-            self.with_now.transpose() * told.by.transpose() + own * told.shifts.transpose();
-        let known = across * (told.weight - told.pull_spread);
+            self.with_now.transpose() * update.by.transpose() + own * update.shifts.transpose();
+        let known = across * (update.weight - update.pull_spread);
         let covariance = self.state.covariance - known * across.transpose();
         let covariance = (covariance + covariance.transpose()) / 2.0;
         if covariance.cholesky().is_none() {
@@ -75,11 +75,11 @@ impl PastState {
             return self.settle();
         }
         self.state.covariance = covariance;
-        self.state.mean += across * told.pull;
+        self.state.mean += across * update.pull;
         // N <- (I - K H) N - K J X', and the covariance over the models of state and S^-1 z.
-        self.with_now = told.carried * self.with_now - told.gained * own.transpose()
-            + told.moved * across.transpose();
-        let gain = across * told.weight;
+        self.with_now = update.carried * self.with_now - update.gained * own.transpose()
+            + update.moved * across.transpose();
+        let gain = across * update.weight;
         for BearingErrorCovariance { camera, by_errors, is_learnt } in seen {
             let change = if *is_learnt {
                 let mut change = gain * by_errors;
@@ -196,7 +196,7 @@ impl FusedTrack {
 
     /// Updates the stored states with a bearing; called before the track's own ties are updated
     /// with it.
-    pub(super) fn update_past(&mut self, camera: &CameraName, told: &CrossUpdate) {
+    pub(super) fn update_past(&mut self, camera: &CameraName, update: &CrossUpdate) {
         if self.past.is_empty() {
             return;
         }
@@ -205,14 +205,14 @@ impl FusedTrack {
             .iter()
             .map(|(name, ties)| BearingErrorCovariance {
                 camera: name,
-                by_errors: told.by * ties.covariance + told.shifts * self.between(camera, name),
+                by_errors: update.by * ties.covariance + update.shifts * self.between(camera, name),
                 is_learnt: self.learns(name),
             })
             .collect();
         let mut past = std::mem::take(&mut self.past);
         let now = self.imm.combined().covariance.cholesky().map(|factor| factor.inverse());
         for past in past.iter_mut().filter(|past| !past.is_settled) {
-            past.learn(camera, told, &seen);
+            past.learn(camera, update, &seen);
             match &now {
                 Some(now) => past.keep_possible(now),
                 None => past.settle(),

@@ -387,15 +387,15 @@ impl FusedTrack {
             Some(ModelUpdate { after: result.as_ref()?, probability })
         });
         let nis = models.clone().map(|model| model.after.nis * model.probability).sum();
-        let told = CrossUpdate::over(models);
+        let update = CrossUpdate::over(models);
         self.note(camera, self.updated_at);
         // First all is predicted, then updated; the past states first, as they need the ties before
         // the update.
         self.predict_past(time);
         self.predict_ties(time.seconds_since(self.updated_at));
         self.begin_to_learn(camera, lasting, time);
-        self.update_past(camera, &told);
-        self.learn(camera, &told);
+        self.update_past(camera, &update);
+        self.learn(camera, &update);
         if let Some(ties) = self.ties.get_mut(camera) {
             ties.lasting_s = lasting.time_s;
         }

@@ -21,8 +21,8 @@ const MOST_REFERENCES: usize = 128;
 /// camera's thread. With half of it a vendor's deepest formula might be refused, and its camera
 /// with it; with four times as much a formula can take all of the stack.
 const MOST_NESTED: usize = 120;
-/// Most operators of a formula: a sum of as many terms is a tree of that depth. With half of it a camera
-/// with a sum of more than 250 operators is refused.
+/// Most operators of a formula: a sum of as many terms is a tree of that depth. With half of it a
+/// camera with a sum of more than 250 operators is refused.
 const MOST_OPERATORS: usize = 500;
 /// Elements within elements, at most: descriptions have five or so. With half of it the same.
 const MOST_ELEMENTS: usize = 1000;

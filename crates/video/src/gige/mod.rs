@@ -316,7 +316,7 @@ impl GigeSource {
     /// The number of a block's frame; those of frames that never came are left out.
     fn numbered(&mut self, block: u64) -> u64 {
         /// Cameras of the first version count to 65535 and then start again from 1. With half of it
-        /// the frame after 65535 would be numbered as if thousands were lost.
+        /// frames that are lost where the count starts again would not be counted.
         const ROUND: u64 = 0xffff;
         let index = self.before.map_or(0, |before| {
             let is_round = block < ROUND / 2 && (ROUND / 2..=ROUND).contains(&before.block);

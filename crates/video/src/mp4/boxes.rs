@@ -35,8 +35,8 @@ pub(super) const MOOV: &[KnownBox] = &[
 const MDIA: &[KnownBox] =
     &[KnownBox(*b"mdhd", Values), KnownBox(*b"hdlr", Values), KnownBox(*b"minf", Boxes(MINF))];
 
-/// The boxes of a track's tables. They must contain the reference to its data (`dinf`), though the
-/// data are always in this file.
+/// The boxes of a track's media information. They must contain where its data are (`dinf`), though
+/// that is always this file.
 const MINF: &[KnownBox] = &[
     KnownBox(*b"dinf", Boxes(&[KnownBox(*b"dref", Counted(&[]))])),
     KnownBox(*b"stbl", Boxes(STBL)),

@@ -125,7 +125,8 @@ impl ServedStream {
         });
     }
 
-    /// Reports to all who watch what the camera's clock has `shown` when the count was at `ticks`.
+    /// Reports to all who watch that the camera's clock showed `shown` when the count was at
+    /// `ticks`.
     pub fn report(&self, shown: Timestamp, ticks: u32) {
         let mut stream = locked(&self.0);
         let report = stream.packetiser.report(shown, ticks);

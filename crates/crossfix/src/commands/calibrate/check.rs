@@ -138,7 +138,7 @@ fn calibrations(recording: &Path, are_replaced: bool) -> anyhow::Result<Vec<Entr
         {
             let message = lacks.read::<CameraCalibration>(&entry.data);
             let is_corrected = message.is_some_and(|message| message.corrects_clock());
-            ensure!(!(are_replaced && is_corrected), is_corrected_already(recording));
+            ensure!(!(are_replaced && is_corrected), corrected_already(recording));
             first.insert(name.clone(), entry);
         }
         Ok(())
@@ -146,7 +146,7 @@ fn calibrations(recording: &Path, are_replaced: bool) -> anyhow::Result<Vec<Entr
     Ok(first.into_values().collect())
 }
 
-fn is_corrected_already(recording: &Path) -> String {
+fn corrected_already(recording: &Path) -> String {
     format!(
         "the bearings of {} were made with a flight's calibration: leave -c away to check that",
         recording.display()

@@ -94,8 +94,7 @@ fn of_landmarks(landmarks: &[LandmarkMisfit]) -> Option<String> {
         return Some(
             "Most landmarks lie beside where the flight has them: their places or the log's are in \
              feet, count from another origin or have a wrong sign, or pictures were taken before a \
-             camera was \
-             moved. Of few landmarks one wrong place may do that."
+             camera was moved. Of few landmarks one wrong place may do that."
                 .to_owned(),
         );
     }

@@ -69,7 +69,8 @@ const MOST_BESIDE_PLACES_S: f64 = 2.0;
 /// leaves would count as those of another lens.
 const LEAST_BENT_PX: f64 = 0.25;
 /// An error of the lens shows as a correlation of at least this between the residuals of
-/// neighbouring stars. With half of it chance would do in a picture of few stars.
+/// neighbouring stars. With half of it what every lens model leaves would count,
+/// in a picture of hundreds of stars; in one of few the limit is what chance allows.
 const LEAST_NEIGHBOUR_CORRELATION: f64 = 0.3;
 /// Distance at which pointing is evaluated for stars, m: so far away that the camera's position
 /// does not count. With half of it the same.

@@ -17,8 +17,8 @@ pub const RUN_UP_S: f64 = 1.0;
 /// When a camera first reports what its clock shows, s after its start, as real cameras do. With
 /// half of it clocks would be known sooner than real ones are.
 const FIRST_REPORT_S: f64 = 2.5;
-/// Interval of further reports, s, like that of real cameras. With half of it clocks would be followed
-/// more closely than real ones are.
+/// Interval of further reports, s, like that of real cameras. With half of it clocks would be
+/// followed more closely than real ones are.
 const REPORT_EVERY_S: f64 = 5.0;
 /// Ticks per second of a stream's time stamps, Hz.
 const TICKS_HZ: f64 = 90_000.0;

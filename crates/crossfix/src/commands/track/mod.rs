@@ -29,9 +29,10 @@ use table::FollowedTable;
 /// from 0; x, y, w, h are the top left corner and the size of the box in pixels; ok is 1 while the
 /// target is measured or shortly predicted; us the microseconds that all targets of the frame took;
 /// id the target; certainty the probability that it is there; sd_x, sd_y the standard deviations of
-/// its place in pixels; vx, vy its velocity in pixels per second; contrast that against its
-/// surroundings in standard deviations of the noise; flicker the share of it that comes and goes;
-/// straightness the share of the last two seconds' way that lies between its ends.
+/// its place in pixels; vx, vy its velocity in pixels per second; contrast the standard deviation
+/// of the brightness that it makes in its box and the margin about it, in those of the noise;
+/// flicker the standard deviation of the contrast as a share of it; straightness the share of the
+/// last two seconds' way that lies between its ends.
 #[derive(Debug, clap::Args)]
 #[command(after_help = examples(&[
     "crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv",
@@ -136,7 +137,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         ));
     }
     ensure!(
-        counted.with_target > 0,
+        counted.with_target > 0 || counted.is_stopped,
         "no target was found in the {} frames of {}",
         counted.tracked,
         args.video.display()
@@ -152,6 +153,8 @@ struct FrameCounts {
     tracked: u64,
     /// Those of the tracked ones with a target.
     with_target: u64,
+    /// Whether the program was asked to stop before the end.
+    is_stopped: bool,
     /// Frames that could not be decoded.
     bad: u64,
 }
@@ -214,6 +217,7 @@ fn follow(
         }
     }
     repeats.remind(Instant::now());
+    counted.is_stopped = shutdown.requested();
     Ok(counted)
 }
 

@@ -61,7 +61,7 @@ const fn independent(
 }
 
 /// A layout that the independent implementation does not have: its condition number is `numpy`'s.
-const fn without_independent(condition: f64, degeneracy: Degeneracy) -> KnownFigures {
+const fn condition_alone(condition: f64, degeneracy: Degeneracy) -> KnownFigures {
     KnownFigures { condition, degeneracy, errors: None }
 }
 
@@ -72,7 +72,7 @@ const INDEPENDENT: [KnownFigures; 8] = [
     independent(f64::INFINITY, Degeneracy::OfTimes, [6.5, 32.0], [3.2, 16.0]),
     independent(f64::INFINITY, Degeneracy::OfTimes, [0.17, 34.0], [0.15, 16.0]),
     independent(f64::INFINITY, Degeneracy::OfTimes, [0.18, 27.0], [0.12, 26.0]),
-    without_independent(94.5, Degeneracy::OfPlace),
+    condition_alone(94.5, Degeneracy::OfPlace),
     independent(469.0, Degeneracy::OfPlace, [3.1, 118.0], [0.44, 12.0]),
     independent(f64::INFINITY, Degeneracy::OfPlace, [3.6, 117.0], [0.41, 11.0]),
 ];
@@ -237,9 +237,9 @@ fn asked(solver: usize, degeneracy: Degeneracy, value: f64, tolerance: f64) -> O
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let (mut conditions, mut positions, mut velocities, mut says) =
         (vec![], vec![], vec![], vec![]);
-    for (number, (layout, independent)) in LAYOUTS.iter().zip(&INDEPENDENT).enumerate() {
+    for (number, (layout, known)) in LAYOUTS.iter().zip(&INDEPENDENT).enumerate() {
         let at = (number + 1) as f64;
-        conditions.push(condition_row(layout, independent, at));
+        conditions.push(condition_row(layout, known, at));
         let runs = runs::all(CHEAP * options.runs, |index| {
             run(layout, &mut Noise::new(options.seed, index))
         });
@@ -247,7 +247,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             let answered: Vec<&SolverOutcome> =
                 runs.iter().filter_map(|run| run[solver].as_ref()).collect();
             let series = format!("{}: {name}", layout.name);
-            let errors = independent.errors.as_ref();
+            let errors = known.errors.as_ref();
             let expected = [errors.map(|e| e.papers), None, errors.map(|e| e.map)][solver];
             for (quantity, rows) in [&mut positions, &mut velocities].into_iter().enumerate() {
                 let errors: Vec<f64> =
@@ -263,11 +263,11 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                         digit,
                     );
                     row = row.independent(value);
-                    row.limit = asked(solver, independent.degeneracy, value, tolerance);
+                    row.limit = asked(solver, known.degeneracy, value, tolerance);
                 }
                 rows.push(row);
             }
-            says.extend(said(&series, at, &answered, independent.degeneracy));
+            says.extend(said(&series, at, &answered, known.degeneracy));
         }
     }
     let table =
@@ -285,16 +285,15 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     ]
 }
 
-fn condition_row(layout: &PaperSite, independent: &KnownFigures, at: f64) -> TableRow {
+fn condition_row(layout: &PaperSite, known: &KnownFigures, at: f64) -> TableRow {
     let exact = lines(layout, &StraightTarget::at_rest(Point3::origin()), None);
     let solution =
         exact.and_then(|[first, second, third]| triple([&first, &second, &third], VELOCITY_SD));
     let condition = solution.map_or(f64::NAN, |s| s.observability.condition_number);
     let row = TableRow::new(layout.name, at, SampleStatistic::exact(condition));
-    if independent.condition > SINGULAR {
+    if known.condition > SINGULAR {
         return row.limit(Limit::AtLeast(SINGULAR));
     }
-    let tolerance = 0.05 * independent.condition;
-    row.independent(independent.condition)
-        .limit(Limit::Near { value: independent.condition, tolerance })
+    let tolerance = 0.05 * known.condition;
+    row.independent(known.condition).limit(Limit::Near { value: known.condition, tolerance })
 }

@@ -31,7 +31,7 @@ impl RobustCost {
     }
 }
 
-/// The loss of one bearing.
+/// The cost of one bearing.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BearingCost {
     pub(super) cost: f64,

@@ -13,7 +13,7 @@ use crate::clocks::common_time::StatedClock;
 struct AbsoluteClock {
     mean: f64,
     variance: f64,
-    /// Variance of the common time's own.
+    /// Variance of the common time itself.
     common: f64,
 }
 
@@ -43,7 +43,8 @@ impl Belief {
     pub(in crate::clocks) fn largest_offset(&self, time: Timestamp) -> f64 {
         let ahead = self.ahead(time);
         let offset = |clock: &ClockEntry| self.relative(clock, 0, ahead);
-        // Relative to the common time an offset is x_k - sum share x + site, as in `absolute`.
+        // Relative to the common time an offset is x_k - sum share x + common_offset, as in
+        // `absolute`.
         let common = self.shares().map(|(clock, share)| share * offset(clock)).sum::<f64>()
             - (self.common_offset[0] + self.common_offset[1] * ahead);
         self.cameras

@@ -55,7 +55,7 @@ struct HandoverBounds {
     tried: usize,
 }
 
-/// See there, also for what breaks with half of each.
+/// The numbers in use; what half of each does is said at its field.
 const BOUNDS: HandoverBounds = HandoverBounds { seen: 20, lost: 20, readings: 4, tried: 50 };
 
 /// The directions that each camera follows alone, and their readings.

@@ -25,8 +25,8 @@ fn image<'a, 'b>(
     title: String,
     size: ImageSize,
 ) -> Result<Chart<'a, 'b>, Failure> {
-    let words = PanelText { title, x: "px", y: "px" };
-    frame(area, &words, Ranges { x: 0.0..f64::from(size.width), y: f64::from(size.height)..0.0 })
+    let text = PanelText { title, x: "px", y: "px" };
+    frame(area, &text, Ranges { x: 0.0..f64::from(size.width), y: f64::from(size.height)..0.0 })
 }
 
 /// The sides of a cell, pixels.

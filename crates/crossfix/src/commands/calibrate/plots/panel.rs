@@ -37,11 +37,11 @@ pub struct Ranges {
 /// A frame with axes and labels.
 pub fn frame<'a, 'b>(
     area: &'a PanelArea<'b>,
-    words: &PanelText<'_>,
+    text: &PanelText<'_>,
     ranges: Ranges,
 ) -> Result<Chart<'a, 'b>, Failure> {
     let mut chart = ChartBuilder::on(area)
-        .caption(&words.title, ("sans-serif", 15))
+        .caption(&text.title, ("sans-serif", 15))
         .margin(10)
         .x_label_area_size(32)
         .y_label_area_size(48)
@@ -50,8 +50,8 @@ pub fn frame<'a, 'b>(
         .configure_mesh()
         .max_light_lines(0)
         .bold_line_style(BLACK.mix(0.12))
-        .x_desc(words.x)
-        .y_desc(words.y)
+        .x_desc(text.x)
+        .y_desc(text.y)
         .draw()?;
     Ok(chart)
 }

@@ -35,8 +35,8 @@ pub fn over_time(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(), Fail
     let Some(time) = span(camera.fitted.iter().map(|label| label.own_time_s)) else {
         return nothing(area, &title, "too few labels");
     };
-    let words = PanelText { title, x: "its own time [s]", y: "px" };
-    let mut chart = frame(area, &words, Ranges { x: time, y: -shown..shown })?;
+    let text = PanelText { title, x: "its own time [s]", y: "px" };
+    let mut chart = frame(area, &text, Ranges { x: time, y: -shown..shown })?;
     for (axis, colour) in [(0, FIRST), (1, SECOND)] {
         let points = thinned(&camera.fitted).map(|label| (label.own_time_s, label.beside_px[axis]));
         dots(&mut chart, points.filter(|(_, px)| px.abs() < shown), colour)?;
@@ -57,8 +57,8 @@ pub fn along_and_across(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(
     sizes.sort_unstable_by(f64::total_cmp);
     // The scale leaves out the largest fiftieth, which a turn or another object causes.
     let shown = (1.3 * sizes[(sizes.len() - 1) * 49 / 50]).max(1.0);
-    let words = PanelText { title, x: "its own time [s]", y: "ms" };
-    let mut chart = frame(area, &words, Ranges { x: time, y: -shown..shown })?;
+    let text = PanelText { title, x: "its own time [s]", y: "ms" };
+    let mut chart = frame(area, &text, Ranges { x: time, y: -shown..shown })?;
     for (points, colour) in [(along, FIRST), (across, SECOND)] {
         let points = points.into_iter().filter(|(_, ms)| ms.abs() < shown);
         chart.draw_series(points.map(|at| Circle::new(at, 2, colour.filled())))?;
@@ -105,8 +105,8 @@ pub fn histogram(camera: &CameraResult, area: &PanelArea<'_>) -> Result<(), Fail
     }
     let normal = |x: f64| (-x * x / 2.0).exp() / std::f64::consts::TAU.sqrt();
     let most = bars.iter().copied().fold(normal(0.0), f64::max);
-    let words = PanelText { title, x: "deviations", y: "density" };
-    let mut chart = frame(area, &words, Ranges { x: -SHOWN..SHOWN, y: 0.0..1.1 * most })?;
+    let text = PanelText { title, x: "deviations", y: "density" };
+    let mut chart = frame(area, &text, Ranges { x: -SHOWN..SHOWN, y: 0.0..1.1 * most })?;
     let low = |bar: usize| bar as f64 * width - SHOWN;
     chart.draw_series(bars.iter().enumerate().map(|(bar, height)| {
         Rectangle::new([(low(bar), 0.0), (low(bar + 1), *height)], FIRST.mix(0.4).filled())
@@ -140,9 +140,9 @@ pub fn autocorrelation(camera: &CameraResult, area: &PanelArea<'_>) -> Result<()
         }
     }
     let variance = squares / f64::from(count.max(1));
-    let words = PanelText { title, x: "time between them [s]", y: "correlation" };
+    let text = PanelText { title, x: "time between them [s]", y: "correlation" };
     let longest_s = step_s * LAGS as f64;
-    let mut chart = frame(area, &words, Ranges { x: 0.0..longest_s, y: -0.3..1.0 })?;
+    let mut chart = frame(area, &text, Ranges { x: 0.0..longest_s, y: -0.3..1.0 })?;
     let found = (1..LAGS)
         .filter(|lag| counts[*lag] > 0)
         .map(|lag| (lag as f64 * step_s, products[lag] / f64::from(counts[lag]) / variance));
