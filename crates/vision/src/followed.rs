@@ -5,6 +5,7 @@ use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
+use crate::detector::ImageMotion;
 use crate::followed_target::ImageTarget;
 use crate::frame::{FrameInput, TargetStep};
 use crate::paper::PaperTarget;
@@ -166,6 +167,15 @@ impl Followed {
     pub(crate) fn expected(&self, after: f64) -> Option<PixelBox> {
         let is_known = !self.is_candidate() && self.target.is_seen();
         is_known.then(|| self.target.box_after(after))
+    }
+
+    /// How it moves, if the detector has found it and its motion is known.
+    pub(crate) fn motion_if_found(&self) -> Option<ImageMotion> {
+        let is_found = matches!(self.origin, TakenUpBy::Detected { is_candidate: false, .. });
+        let [x, y] = self.target.covariances().filter(|_| is_found)?;
+        let velocity = self.target.velocity();
+        let sd = ((x.m22 + y.m22) / 2.0).sqrt();
+        Some(ImageMotion { place: self.target.position(), velocity: [velocity.x, velocity.y], sd })
     }
 
     /// Whether it was found by the detector, and has been elsewhere since.
