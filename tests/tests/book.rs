@@ -1,7 +1,6 @@
 //! Every command of the book, run as its reader runs it: each page's blocks marked `sh`, in their
 //! order, in a folder of their own that holds the repository's `configs` and `recordings`. Blocks
-//! marked
-//! `sh,ignore` need what is not here: a camera, another host, the system's administrator.
+//! marked `sh,ignore` need what is not here: a camera, another host, the system's administrator.
 
 #![allow(
     clippy::unwrap_used,

@@ -41,7 +41,7 @@ impl ImageTracker {
     /// or a new one.
     pub(crate) fn take_up_new(&mut self, image: &Plane, time: Timestamp, interval: f64) {
         let given = std::mem::take(&mut self.waiting);
-        let found = self.detect(image, time, interval, &given);
+        let found = self.detect(image, interval, &given);
         self.take_up_late(image, time);
         for given in given {
             let meant = self.meant(image, given);
@@ -220,13 +220,7 @@ impl ImageTracker {
 
     /// What the detector finds beside the targets that are followed or just given; targets that it
     /// takes for the scene are given up.
-    fn detect(
-        &mut self,
-        image: &Plane,
-        time: Timestamp,
-        interval: f64,
-        given: &[PixelBox],
-    ) -> Vec<Found> {
+    fn detect(&mut self, image: &Plane, interval: f64, given: &[PixelBox]) -> Vec<Found> {
         self.call_detector();
         let Some(detector) = &mut self.detector else { return Vec::new() };
         let turned = self.scene.turned();
@@ -251,16 +245,14 @@ impl ImageTracker {
             id: followed.id,
             place: followed.target.box_after(0.0),
             is_watched: followed.has_moved(),
-            motion: followed.motion_if_found(),
-            age_s: time.seconds_since(followed.since),
+            velocity_sd: followed.velocity_sd_if_found(),
         });
         // A target to be has no number yet: this one is nobody's.
         let given = given.iter().map(|place| KnownTarget {
             id: ImageTrackId(u64::MAX),
             place: *place,
             is_watched: false,
-            motion: None,
-            age_s: 0.0,
+            velocity_sd: None,
         });
         let known: Vec<KnownTarget> = known.chain(given).collect();
         let findings = detector.step(image, interval, turned, &known);

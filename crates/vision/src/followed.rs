@@ -5,7 +5,6 @@ use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
-use crate::detector::ImageMotion;
 use crate::followed_target::ImageTarget;
 use crate::frame::{FrameInput, TargetStep};
 use crate::paper::PaperTarget;
@@ -169,13 +168,11 @@ impl Followed {
         is_known.then(|| self.target.box_after(after))
     }
 
-    /// How it moves, if the detector has found it and its motion is known.
-    pub(crate) fn motion_if_found(&self) -> Option<ImageMotion> {
-        let is_found = matches!(self.origin, TakenUpBy::Detected { is_candidate: false, .. });
+    /// How well its velocity is known, px/s per axis, if the detector has found it.
+    pub(crate) fn velocity_sd_if_found(&self) -> Option<f64> {
+        let is_found = matches!(self.origin, TakenUpBy::Detected { .. });
         let [x, y] = self.target.covariances().filter(|_| is_found)?;
-        let velocity = self.target.velocity();
-        let sd = ((x.m22 + y.m22) / 2.0).sqrt();
-        Some(ImageMotion { place: self.target.position(), velocity: [velocity.x, velocity.y], sd })
+        Some(((x.m22 + y.m22) / 2.0).sqrt())
     }
 
     /// Whether it was found by the detector, and has been elsewhere since.

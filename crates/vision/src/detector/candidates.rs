@@ -4,7 +4,7 @@
 use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
 
 use super::LEAST_PLOTS;
-use super::common_motion::ImageMotion;
+use super::common_motion::MovingThing;
 use super::plots::Plot;
 use crate::ImagePoint;
 
@@ -145,9 +145,10 @@ pub(super) struct Candidate {
     first: [f64; 2],
     /// Its first place in the image.
     first_in_image: ImagePoint,
-    /// Largest distance that it has been from its first place, in the scene as in the image, px:
-    /// what is on the lens or written over the picture keeps its place there when the camera turns.
+    /// Largest distance that it has been from its first place, px: in the scene, ...
     pub(super) gone_px: f64,
+    /// ... and in the image.
+    pub(super) gone_in_image_px: f64,
 }
 
 impl Candidate {
@@ -165,13 +166,14 @@ impl Candidate {
             first: place,
             first_in_image: plot.place,
             gone_px: 0.0,
+            gone_in_image_px: 0.0,
         }
     }
 
-    /// How it moves in the image, where the scene is known to turn by `turning`, px/s.
-    pub(super) fn motion(&self, turning: [f64; 2]) -> ImageMotion {
+    /// How it moves in the image, where the scene is registered as turning by `turning`, px/s.
+    pub(super) fn moving(&self, turning: [f64; 2]) -> MovingThing {
         let variance = self.axes.iter().map(|axis| axis.covariance().m22).sum::<f64>() / 2.0;
-        ImageMotion {
+        MovingThing {
             place: self.plot.place,
             velocity: [0, 1].map(|i| self.axes[i].velocity() - turning[i]),
             sd: variance.sqrt(),
@@ -227,10 +229,10 @@ impl Candidate {
             axis.measurement_update(AxisMeasurement { position, variance: plot.variance() });
         }
         let off = [0, 1].map(|i| self.axes[i].position() - self.first[i]);
-        let off_in_image =
-            [plot.place.x - self.first_in_image.x, plot.place.y - self.first_in_image.y];
-        let gone = off[0].hypot(off[1]).min(off_in_image[0].hypot(off_in_image[1]));
-        self.gone_px = self.gone_px.max(gone);
+        self.gone_px = self.gone_px.max(off[0].hypot(off[1]));
+        let ImagePoint { x, y } = self.first_in_image;
+        self.gone_in_image_px =
+            self.gone_in_image_px.max((plot.place.x - x).hypot(plot.place.y - y));
         // ln (P_D N(innovation; 0, S) / clutter), with P_D the probability of a plot.
         let PlotInnovation { squared, determinant } = innovation;
         let there = -0.5 * squared - (std::f64::consts::TAU * determinant.sqrt()).ln();
@@ -381,12 +383,12 @@ impl Candidates {
             .filter(|candidate| candidate.plots >= LEAST_PLOTS && candidate.log_ratio() > 0.0)
     }
 
-    /// Lets those of which a condition is true begin anew where they are.
-    pub(super) fn begin_anew_if(&mut self, is_meant: impl Fn(&Candidate) -> bool) {
+    /// Lets the distance of those of which a condition is true count from where they are.
+    pub(super) fn restart_distance_if(&mut self, is_meant: impl Fn(&Candidate) -> bool) {
         for candidate in self.list.iter_mut().filter(|candidate| is_meant(candidate)) {
             candidate.first = [0, 1].map(|i| candidate.axes[i].position());
             candidate.first_in_image = candidate.plot.place;
-            candidate.gone_px = 0.0;
+            (candidate.gone_px, candidate.gone_in_image_px) = (0.0, 0.0);
         }
     }
 

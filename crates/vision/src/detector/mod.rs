@@ -27,8 +27,7 @@ use crossfix_correlation::Plane;
 use crate::crop::{paint_over, replace_invalid};
 use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
-use common_motion::CommonMotion;
-pub(crate) use common_motion::ImageMotion;
+use common_motion::{CommonMotion, FoundTarget};
 use filter::{StandOutScratch, between, halve, stand_out};
 use level::{Cells, Level, Moment};
 use plots::Plot;
@@ -96,10 +95,9 @@ const LEAST_NEW: f64 = 0.3;
 /// 0.6, and so is a target that flies in front of its like for as long.
 const NEW_S: f64 = 0.5;
 
-/// What moves with the scene is the scene if it was found no longer than this before most of what
-/// moves began to move alike, s: what was found earlier has moved by itself. With half of it 6 %
-/// more false boxes are left where heads pan over bare skies.
-const BEFORE_ALIKE_S: f64 = 0.5;
+/// Averaging time of the registered turn, s: a jerk of one image is no turn. With half of it a jerk
+/// of 20 px makes all that is in view move at 200 px/s instead of 100.
+const TURN_S: f64 = 0.2;
 
 /// A target that is followed already.
 #[derive(Clone, Copy, Debug)]
@@ -108,10 +106,8 @@ pub(crate) struct KnownTarget {
     pub(crate) place: PixelBox,
     /// Whether the background at its place is known from before it came.
     pub(crate) is_watched: bool,
-    /// How it moves, if the detector has found it.
-    pub(crate) motion: Option<ImageMotion>,
-    /// How long it has been followed, s.
-    pub(crate) age_s: f64,
+    /// How well its velocity is known, px/s, if the detector has found it.
+    pub(crate) velocity_sd: Option<f64>,
 }
 
 /// A new target.
@@ -158,10 +154,12 @@ pub(crate) struct Detector {
     lost_s: f64,
     plots: Vec<Plot>,
     candidates: Candidates,
-    /// By how much the scene had moved in the image before, px.
+    /// `turned` of the last image, px, and a running mean of its change, px/s.
     turned: [f64; 2],
+    turning: [f64; 2],
     /// How long most of what moves has moved alike, s.
     alike_s: f64,
+    found_targets: Vec<FoundTarget>,
     watches: Vec<SceneSuspect>,
 }
 
@@ -178,7 +176,9 @@ impl Detector {
             plots: Vec::new(),
             candidates: Candidates::default(),
             turned: [0.0; 2],
+            turning: [0.0; 2],
             alike_s: 0.0,
+            found_targets: Vec::new(),
             watches: Vec::new(),
         }
     }
@@ -201,6 +201,7 @@ impl Detector {
         let Some(finest) = self.levels.first_mut() else { return Findings::default() };
         halve(image, &mut finest.reduced);
         replace_invalid(&mut finest.reduced);
+        self.note_motion(interval, turned, known);
         // How much the known targets stand out is measured before they are painted over.
         self.watch(known);
         for known in known {
@@ -224,10 +225,9 @@ impl Detector {
         let mut findings = Findings { found: Vec::new(), scene };
         if is_warm {
             self.plot(interval, turned, known);
-            findings.scene.extend(self.part_from_scene(interval, turned, known));
+            findings.scene.extend(self.take_common_motion(interval));
             findings.found = self.find(image, known);
         }
-        self.turned = turned;
         findings
     }
 
@@ -237,7 +237,7 @@ impl Detector {
             *level = Level::new(level.cell());
         }
         (self.images, self.settled_s) = (0, 0.0);
-        (self.has_warmed, self.lost_s) = (false, 0.0);
+        (self.has_warmed, self.lost_s, self.alike_s) = (false, 0.0, 0.0);
         self.candidates = Candidates::default();
         self.watches.clear();
     }
@@ -317,29 +317,44 @@ impl Detector {
         self.candidates.step(&self.plots, turned, interval, self.sides);
     }
 
-    /// Takes what moves as most of what moves does for the scene: candidates begin anew where they
-    /// are, and known targets that have been found while that went on are returned.
-    fn part_from_scene(
-        &mut self,
-        interval: f64,
-        turned: [f64; 2],
-        known: &[KnownTarget],
-    ) -> Vec<ImageTrackId> {
-        // What is registered of a bare scene's turn, px/s, is a part of it.
-        let turning = [0, 1].map(|i| (turned[i] - self.turned[i]) / interval);
-        let candidates = self.candidates.likely().map(|candidate| candidate.motion(turning));
-        let all = known.iter().filter_map(|known| known.motion).chain(candidates);
+    /// Notes how the scene turns, as far as it is registered, and how known targets move.
+    fn note_motion(&mut self, interval: f64, turned: [f64; 2], known: &[KnownTarget]) {
+        let share = 1.0 - (-interval / TURN_S).exp();
+        for (turning, (now, before)) in
+            self.turning.iter_mut().zip(turned.into_iter().zip(self.turned))
+        {
+            *turning += share * ((now - before) / interval - *turning);
+        }
+        self.turned = turned;
+        self.found_targets.retain(|found| known.iter().any(|known| known.id == found.id));
+        for known in known {
+            let Some(sd) = known.velocity_sd else { continue };
+            let place = known.place.centre();
+            match self.found_targets.iter_mut().find(|found| found.id == known.id) {
+                Some(found) => found.take(place, sd, interval),
+                None => self.found_targets.push(FoundTarget::new(known.id, place)),
+            }
+        }
+    }
+
+    /// Where most of what moves moves alike, that is the scene: the distance of such candidates
+    /// counts from here, and the targets that have turned out to be the scene are returned.
+    fn take_common_motion(&mut self, interval: f64) -> Vec<ImageTrackId> {
+        // What is registered of a bare scene's turn is a part of it.
+        let turning = self.turning;
+        let candidates = self.candidates.likely().map(|candidate| candidate.moving(turning));
+        let all = self.found_targets.iter().map(|found| found.now).chain(candidates);
         let Some(scene) = CommonMotion::of(all, self.sides) else {
             self.alike_s = 0.0;
             return Vec::new();
         };
         self.alike_s += interval;
-        self.candidates.begin_anew_if(|candidate| scene.holds(&candidate.motion(turning)));
-        let is_scene = |known: &&KnownTarget| {
-            known.age_s < self.alike_s + BEFORE_ALIKE_S
-                && known.motion.is_some_and(|motion| scene.holds(&motion))
-        };
-        known.iter().filter(is_scene).map(|known| known.id).collect()
+        self.candidates.restart_distance_if(|candidate| scene.holds(&candidate.moving(turning)));
+        let alike_s = self.alike_s;
+        self.found_targets
+            .extract_if(.., |found| found.is_scene(&scene, alike_s, interval))
+            .map(|found| found.id)
+            .collect()
     }
 
     /// The candidates that are found.
@@ -362,9 +377,14 @@ impl Detector {
 fn is_found(candidate: &Candidate, sway_px: f64, asked: f64) -> bool {
     // The two ways in which what stays in its place seems to move: the scene sways, and a plot's
     // place is known to a cell over its strength only.
-    let moved =
-        SWAYS * sway_px + PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
-    candidate.plots >= LEAST_PLOTS && candidate.gone_px > moved && candidate.log_ratio() > asked
+    let place_error = PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
+    let moved = SWAYS * sway_px + place_error;
+    candidate.plots >= LEAST_PLOTS
+        && candidate.gone_px > moved
+        // What is on the lens or written over the picture keeps its place there when the camera
+        // turns.
+        && candidate.gone_in_image_px > place_error
+        && candidate.log_ratio() > asked
 }
 
 /// By how much a place stands out on a scale, computed from the finest scale's means.
