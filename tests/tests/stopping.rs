@@ -205,8 +205,15 @@ fn a_command_that_hangs_ends_when_it_is_asked_to_and_leaves_nothing() {
     // Nobody will ever write to this pipe.
     assert!(std::process::Command::new("mkfifo").arg(&silent).status().unwrap().success());
     let [silent_name, table_name] = [&silent, &table].map(|path| path.to_str().unwrap());
-    let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/two-uavs.mcap");
-    let export = ["export", recording, "--csv", table_name, "--times", silent_name];
+    let bearings = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/two-uavs.mcap");
+    let elsewhere = tempfile::tempdir().unwrap();
+    let tracks = elsewhere.path().join("tracks.mcap").to_str().unwrap().to_owned();
+    let fused = std::process::Command::new(crossfix_tests::program())
+        .args(["-q", "replay", bearings, "--fuse", "-o", &tracks])
+        .output()
+        .unwrap();
+    assert!(fused.status.success(), "{}", String::from_utf8_lossy(&fused.stderr));
+    let export = ["export", &tracks, "--csv", table_name, "--times", silent_name];
     let (ended, took) = terminated(&export, || {
         // The table has been begun.
         assert_eq!(files_of(folder.path()).len(), 2, "{:?}", files_of(folder.path()));

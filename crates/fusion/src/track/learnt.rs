@@ -12,9 +12,9 @@
 //! L_k are part of W. A bearing has the Jacobians H by the state and J by its camera's errors.
 
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{DMatrix, Dyn, Matrix2, Matrix6, OMatrix, U2, U5, U6, Vector2};
+use nalgebra::{DMatrix, Dyn, Matrix2, Matrix6, OMatrix, U2, U6, Vector2};
 
-use super::ties::Rescaling;
+use super::ties::{LearntTies, Rescaling};
 use super::{FusedTrack, Ties};
 use crate::uncertainty::{CONSIDERED, CorrelatedNoise, LASTING, SharedCovariance, SharedErrors};
 use crate::update::CrossUpdate;
@@ -26,9 +26,6 @@ const MAX_LEARNT: usize = 8;
 /// After this many decay times of an error nothing is left of what has been learnt of it (e^-5),
 /// and another camera may take its place. With half of it 8 % is thrown away.
 const FORGOTTEN: f64 = 5.0;
-
-/// L_k: covariance of the learnt errors with the shared errors of one camera.
-pub(super) type LearntTies = OMatrix<f64, Dyn, U5>;
 
 /// The cameras whose lasting errors a track learns, and the estimates, in units of the errors' own
 /// deviations.

@@ -7,15 +7,17 @@
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Unit, Vector2, Vector3};
+use nalgebra::{Dyn, Matrix2, Matrix2x3, Matrix2x6, OMatrix, U5, Unit, Vector2, Vector3};
 
-use super::learnt::LearntTies;
 use super::{BearingInnovation, FusedTrack, TrackBearing};
 use crate::cameras::{ClockChange, RecentBearings, ScaleSample, ThirdDifferences};
 use crate::motion::MotionSetup;
 use crate::uncertainty::{CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies};
 use crate::update::{CrossUpdate, ModelUpdate, Updated};
 use crate::visibility::Visibility;
+
+/// L_k: covariance of the learnt errors with the shared errors of one camera.
+pub(super) type LearntTies = OMatrix<f64, Dyn, U5>;
 
 /// A change of the variance of errors that a track is tied to.
 #[derive(Clone, Copy, Debug)]

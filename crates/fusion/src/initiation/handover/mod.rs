@@ -228,7 +228,7 @@ impl Handover {
                 if is_read || is_full || !one.tried.insert(number) {
                     continue;
                 }
-                let reading = Reading::begin(camera, one, index, context, &self.rules);
+                let reading = one.read_in(camera, index, context, &self.rules);
                 one.readings.extend(reading.filter(|reading| reading.ratio() > GIVEN_UP));
             }
         }

@@ -5,7 +5,6 @@ use crossfix_message::CameraName;
 
 use super::super::MAX_LINES;
 use super::super::one_target::{Mobility, OneTargetTest};
-use super::seen::SeenDirection;
 use crate::cameras::{KnownCamera, view_sr};
 use crate::motion::MotionSetup;
 use crate::spatial::LineId;
@@ -83,30 +82,27 @@ pub(super) struct Reading {
 }
 
 impl Reading {
-    /// The reading that what `camera` has followed alone is now seen in the exposure's line of this
-    /// index. `None` if the two do not meet, or the numbers fail.
+    /// The reading that the target of a track is now seen in the exposure's line of this index.
+    /// `of` is whose direction the track is of, and `one_target` what is known of that. `None` if
+    /// the line does not fit.
     pub(super) fn begin(
-        camera: &CameraName,
-        one: &SeenDirection,
+        of: (CameraName, u64),
+        track: FusedTrack,
+        one_target: OneTargetTest,
         index: usize,
         context: &ReadingContext<'_>,
         rules: &Rules,
     ) -> Option<Self> {
-        let ReadingContext { exposure, known, motion, .. } = *context;
+        let ReadingContext { exposure, known, .. } = *context;
         let line = &exposure.sightings[index].line;
-        let track = one.placed(camera, line, exposure.time, rules, motion)?;
         // Price of the velocity that the reading implies: v^2 / (2 sd^2), of a prior about zero.
         let unlikely = track.state().velocity().norm_squared() / (2.0 * rules.speed.powi(2));
         let expected = context.expectation(&track)?;
         let fit = expected.fit(line, rules.gate)?;
         // Against one other target in the view: the line is there, so it is not weighed by P_D.
         let ratio = fit.log_ratio(1.0, rules.clutter_per_sr(known)) - unlikely;
-        let mut reading = Self {
-            of: (camera.clone(), one.number),
-            track: Box::new(track),
-            one_target: OneTargetTest::of_one(camera, one.sight.clone()),
-            newest: LineId::new(exposure, index),
-        };
+        let mut reading =
+            Self { of, track: Box::new(track), one_target, newest: LineId::new(exposure, index) };
         reading.take(context, index, &expected, ratio, rules)?;
         Some(reading)
     }

@@ -7,9 +7,10 @@ use crossfix_geometry::{BearingModel, Ray, SightLine, passing_ranges};
 use crossfix_message::{CameraName, Cued, Solver, Timestamp};
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
+use super::super::one_target::OneTargetTest;
 use super::super::sight::DirectionFilter;
 use super::Rules;
-use super::reading::Reading;
+use super::reading::{Reading, ReadingContext};
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
@@ -133,10 +134,26 @@ impl SeenDirection {
         sight
     }
 
+    /// The reading that what `camera` has followed alone is now seen in the exposure's line of this
+    /// index. `None` if the two do not meet, or the numbers fail.
+    pub(super) fn read_in(
+        &self,
+        camera: &CameraName,
+        index: usize,
+        context: &ReadingContext<'_>,
+        rules: &Rules,
+    ) -> Option<Reading> {
+        let ReadingContext { exposure, motion, .. } = *context;
+        let line = &exposure.sightings[index].line;
+        let track = self.placed(camera, line, exposure.time, rules, motion)?;
+        let one_target = OneTargetTest::of_one(camera, self.sight.clone());
+        Reading::begin((camera.clone(), self.number), track, one_target, index, context, rules)
+    }
+
     /// A track of it, as `camera` has followed it, at the position where its direction at a time
     /// crosses another camera's line. `None` if the lines do not cross within range in front of
     /// both cameras.
-    pub(super) fn placed(
+    fn placed(
         &self,
         camera: &CameraName,
         line: &SightLine,
