@@ -70,6 +70,24 @@ pub(crate) fn crop(image: &Plane, corner: [isize; 2], sides: [usize; 2], part: &
     }
 }
 
+/// Paints over the given columns and rows of a part, row by row from the pixel left of them to that
+/// right of them: a flat patch would have edges, which stand out. At the part's edge there is one
+/// side alone; what reaches from edge to edge is left, as nothing beside it says what it hides.
+pub(crate) fn paint_over(part: &mut Plane, columns: &Range<usize>, rows: Range<usize>) {
+    if columns.is_empty() {
+        return;
+    }
+    for y in rows {
+        let row = part.row_mut(y);
+        let left = columns.start.checked_sub(1).map(|x| row[x]);
+        let Some(left) = left.or(row.get(columns.end).copied()) else { continue };
+        let right = row.get(columns.end).copied().unwrap_or(left);
+        for (x, sample) in row[columns.clone()].iter_mut().enumerate() {
+            *sample = left + (right - left) * (x as f32 + 0.5) / columns.len() as f32;
+        }
+    }
+}
+
 /// One border of the part that is inside an image.
 struct Border {
     is_first: bool,

@@ -3,8 +3,8 @@
 
 use crate::ImagePoint;
 
-/// Averaging time of the flicker, s. With half of it a bird's wing beat of 2 Hz is averaged over one
-/// beat, and comes and goes with it.
+/// Averaging time of the flicker, s. With half of it a bird's wing beat of 2 Hz is averaged over
+/// one beat, and comes and goes with it.
 const FLICKER_S: f64 = 1.0;
 /// Averaging time of the way, s. With half of it a bird's swing of a second counts as straight.
 const WAY_S: f64 = 2.0;
@@ -12,8 +12,8 @@ const WAY_S: f64 = 2.0;
 /// How a target looks and moves, beside its size and speed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TargetFeatures {
-    /// Its contrast against what is about it: root mean square over its box, standard deviations of
-    /// the image's noise.
+    /// Its contrast: standard deviation of the brightness that it makes in its box and the margin
+    /// about it, in standard deviations of the image's noise.
     pub contrast: f64,
     /// Standard deviation of the contrast from image to image over about a second, as a share of
     /// the contrast, without what the noise explains: wings beat, rotors hardly.

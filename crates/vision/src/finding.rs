@@ -7,9 +7,8 @@ use crossfix_message::Timestamp;
 use crate::config::Algorithm;
 use crate::detector::{Detector, Found, KnownTarget};
 use crate::figure::meant;
-use crate::followed::{Followed, Follower, TakenUpBy, box_of, describe};
+use crate::followed::{Followed, Follower, TakenUpBy, describe};
 use crate::frame::{FrameInput, Others, TargetStep};
-use crate::tracker::are_near;
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
     TrackerPart,
@@ -54,8 +53,11 @@ impl ImageTracker {
         // A stand-in may look like its target by now.
         for index in 0..self.followed.len() {
             let stand_in = self.followed[index].stand_in;
-            let place =
-                self.followed.iter().find(|f| Some(f.id) == stand_in).map(|f| box_of(&f.target));
+            let place = self
+                .followed
+                .iter()
+                .find(|f| Some(f.id) == stand_in)
+                .map(|f| f.target.box_after(0.0));
             if let Some(place) = place {
                 self.is_lost_one(image, place, time, interval);
             }
@@ -98,7 +100,7 @@ impl ImageTracker {
         if origin == TakenUpBy::Given {
             target.begin_centring(&self.config);
         }
-        let is_beneath = |f: &&Followed| are_near(&f.target, &target, 0.0);
+        let is_beneath = |f: &&Followed| f.target.box_after(0.0).is_near(&target.box_after(0.0));
         let began_on = self.followed.iter().find(is_beneath).map(|followed| followed.id);
         let step = TargetStep { measured: None, score: 1.0, certainty: 1.0, nis: None };
         self.tracks.push(describe(id, &target, TrackPhase::Tentative, step));
@@ -223,7 +225,7 @@ impl ImageTracker {
         let Some(detector) = &mut self.detector else { return Vec::new() };
         let turned = self.scene.turned();
         for followed in &mut self.followed {
-            let place = box_of(&followed.target);
+            let place = followed.target.box_after(0.0);
             let (at, side) = (place.centre(), place.width.max(place.height));
             // Nobody knows where a lost target is.
             if let TakenUpBy::Detected { first, turned: then, has_moved, .. } = &mut followed.origin
@@ -241,14 +243,16 @@ impl ImageTracker {
         let seen = self.followed.iter().filter(|followed| !followed.target.is_searching());
         let known = seen.map(|followed| KnownTarget {
             id: followed.id,
-            place: box_of(&followed.target),
+            place: followed.target.box_after(0.0),
             is_watched: followed.has_moved(),
+            velocity_sd: followed.velocity_sd_if_found(),
         });
         // A target to be has no number yet: this one is nobody's.
         let given = given.iter().map(|place| KnownTarget {
             id: ImageTrackId(u64::MAX),
             place: *place,
             is_watched: false,
+            velocity_sd: None,
         });
         let known: Vec<KnownTarget> = known.chain(given).collect();
         let findings = detector.step(image, interval, turned, &known);

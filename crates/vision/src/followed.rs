@@ -87,7 +87,7 @@ impl Follower {
         }
     }
 
-    pub(crate) fn velocity(&self) -> ImagePoint {
+    fn velocity(&self) -> ImagePoint {
         match self {
             Self::Posterior(target) => target.state.velocity(),
             Self::Paper(target) => target.velocity(),
@@ -99,6 +99,14 @@ impl Follower {
             Self::Posterior(target) => Some(target.covariances()),
             Self::Paper(target) => target.axes().map(|[x, y]| [x.covariance(), y.covariance()]),
         }
+    }
+
+    /// Its box after this time, s, if it flies straight on.
+    pub(crate) fn box_after(&self, after: f64) -> PixelBox {
+        let (at, velocity) = (self.position(), self.velocity());
+        let there = ImagePoint { x: at.x + after * velocity.x, y: at.y + after * velocity.y };
+        let [width, height] = self.size();
+        PixelBox::about(there, width, height)
     }
 
     /// How it looks and moves; the papers' algorithm does not say.
@@ -156,24 +164,21 @@ impl Followed {
 
     /// Its box after this time, s; `None` where it is not seen, or is a candidate.
     pub(crate) fn expected(&self, after: f64) -> Option<PixelBox> {
-        if self.is_candidate() || !self.target.is_seen() {
-            return None;
-        }
-        let (at, velocity) = (self.target.position(), self.target.velocity());
-        let there = ImagePoint { x: at.x + after * velocity.x, y: at.y + after * velocity.y };
-        let [width, height] = self.target.size();
-        Some(PixelBox::about(there, width, height))
+        let is_known = !self.is_candidate() && self.target.is_seen();
+        is_known.then(|| self.target.box_after(after))
+    }
+
+    /// How well its velocity is known, px/s per axis, if the detector has found it.
+    pub(crate) fn velocity_sd_if_found(&self) -> Option<f64> {
+        let is_found = matches!(self.origin, TakenUpBy::Detected { .. });
+        let [x, y] = self.target.covariances().filter(|_| is_found)?;
+        Some(((x.m22 + y.m22) / 2.0).sqrt())
     }
 
     /// Whether it was found by the detector, and has been elsewhere since.
     pub(crate) fn has_moved(&self) -> bool {
         matches!(self.origin, TakenUpBy::Detected { has_moved: true, .. })
     }
-}
-
-pub(crate) fn box_of(target: &Follower) -> PixelBox {
-    let [width, height] = target.size();
-    PixelBox::about(target.position(), width, height)
 }
 
 /// The track of a target after a step.

@@ -36,14 +36,17 @@ impl FrameInput<'_> {
 
 /// A target as the others know it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct KnownPlace {
+pub(crate) struct OtherTarget {
     pub(crate) id: ImageTrackId,
     /// Since when it has been followed.
     pub(crate) since: Timestamp,
+    /// When it was last measured.
+    pub(crate) measured_at: Timestamp,
     /// The target on whose place it was taken up, until the two have been apart.
     pub(crate) began_on: Option<ImageTrackId>,
-    /// Its box: in this image, if it has been followed into it, or as predicted. `None` for one that
-    /// is not seen, on probation or a candidate.
+    /// Its box: in this image, if it has been followed into it, or as predicted. `None` for one
+    /// that is not seen, on probation or a candidate, and for a prediction where the camera was
+    /// jerked.
     pub(crate) place: Option<PixelBox>,
 }
 
@@ -51,11 +54,9 @@ pub(crate) struct KnownPlace {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Others<'a> {
     /// All targets.
-    pub(crate) all: &'a [KnownPlace],
+    pub(crate) all: &'a [OtherTarget],
     /// Index of the target itself.
     pub(crate) own: usize,
-    /// When it was last measured.
-    pub(crate) measured_at: Timestamp,
 }
 
 impl Others<'_> {
@@ -68,12 +69,12 @@ impl Others<'_> {
             let are_one = own.began_on == Some(other.id)
                 || other.began_on == Some(own.id)
                 || (own.began_on.is_some() && own.began_on == other.began_on);
-            other.place.filter(|_| !are_one && other.since < self.measured_at)
+            other.place.filter(|_| !are_one && other.since < own.measured_at)
         })
     }
 
     /// Whether a box has pixels in common with another's.
-    pub(crate) fn overlap(self, place: &PixelBox) -> bool {
+    pub(crate) fn any_overlaps(self, place: &PixelBox) -> bool {
         self.iter().any(|other| other.overlaps(place))
     }
 }

@@ -7,7 +7,7 @@ use crossfix_correlation::Plane;
 use crossfix_filter::Gate;
 
 use crate::config::GateRule;
-use crate::crop::crop;
+use crate::crop::{crop, paint_over};
 use crate::frame::FrameInput;
 use crate::likelihood::log_ratios;
 use crate::motion::ImageMotion;
@@ -149,7 +149,7 @@ impl TargetBelief {
         let Region { origin, corner, sides, .. } = region;
         crop(image, corner, sides, &mut scratch.gate);
         for other in frame.others.iter() {
-            paint_over(&mut scratch.gate, corner, &other);
+            hide(&mut scratch.gate, corner, &other);
         }
         scratch.correlator.statistics(
             &scratch.gate,
@@ -173,24 +173,13 @@ impl TargetBelief {
 /// left about what is painted over, and may be taken for a target.
 const EDGE_PX: f64 = 1.0;
 
-/// Paints over another target's box in a part of an image that begins at `corner`, row by row from
-/// the pixel left of it to that right of it: what is there is not this target's. Of two that cross
-/// the first is not seen, and coasts on its velocity until they are apart; the other goes on. A box
-/// as wide as the part is left, as nothing beside it says what it hides.
-fn paint_over(part: &mut Plane, corner: [isize; 2], other: &PixelBox) {
+/// Paints over another target's box in a part of an image that begins at `corner`: what is there is
+/// not this target's. Of two that cross the first is not seen, and coasts on its velocity until
+/// they are apart; the other goes on.
+fn hide(part: &mut Plane, corner: [isize; 2], other: &PixelBox) {
     let columns = covered(other.x, other.width, corner[0], part.width());
-    if columns.is_empty() || columns.len() == part.width() {
-        return;
-    }
-    for y in covered(other.y, other.height, corner[1], part.height()) {
-        let row = part.row_mut(y);
-        let right = row.get(columns.end).copied();
-        let left = columns.start.checked_sub(1).map(|x| row[x]).or(right).unwrap_or_default();
-        let right = right.unwrap_or(left);
-        for (x, sample) in row[columns.clone()].iter_mut().enumerate() {
-            *sample = left + (right - left) * (x as f32 + 0.5) / columns.len() as f32;
-        }
-    }
+    let rows = covered(other.y, other.height, corner[1], part.height());
+    paint_over(part, &columns, rows);
 }
 
 /// The columns (or rows) of a part of an image that a box from `at` covers with its blurred edge;

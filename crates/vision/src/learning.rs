@@ -1,12 +1,12 @@
 //! What is learnt of a target from an image: its contrast, size, direction and appearance.
 
-use crate::ImagePoint;
 use crate::features::{FeatureSample, TargetFeatures};
 use crate::fit::{ShapeChange, TargetFit};
 use crate::frame::FrameInput;
 use crate::scratch::Scratch;
 use crate::state::{SEEN, TargetBelief};
 use crate::tracker_part::TrackerPart;
+use crate::{ImagePoint, PixelBox};
 
 /// Averaging time of the usual contrast, s: longer than a cloud takes it away. With half of it one
 /// second at a cloud's edge takes it half-way to the dimmed contrast, instead of 28 % of the way.
@@ -25,7 +25,7 @@ const LEARNING_MATCHES: [f64; 2] = [0.7, 0.95];
 /// Share with which such an image is learned all the same: it may be the target that has changed.
 /// With half of it two of 24 drawn targets that turn from bright to dark within two seconds are
 /// lost; with none six.
-pub(crate) const LEARNT_ANYWAY: f64 = 0.2;
+const LEARNT_ANYWAY: f64 = 0.2;
 /// Averaging time of the usual match, s. With half of it a mast is what usually matches sooner: a
 /// third more of the frames of such scenes are lost; with three times as much a target that turns
 /// is learnt too slowly, and on infrared video twice as many are lost.
@@ -49,6 +49,12 @@ const SHAPE_FLOOR: f64 = 0.05;
 /// 0 below the first value, 1 above the second, linear between.
 fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
     ((value - low) / (high - low)).clamp(0.0, 1.0)
+}
+
+/// Energy under the reference in an image: the target's own, `c^2 k E`, and the noise's, `n v`.
+struct EnergyInReference {
+    own: f64,
+    noise: f64,
 }
 
 impl TargetBelief {
@@ -102,8 +108,7 @@ impl TargetBelief {
         let clear = f64::from(self.appearance.clear_share());
         // The reference's noise is taken out: z / clear, with the variance v / (E clear^2).
         let measured = measured / clear;
-        let variance = f64::from(self.noise / self.appearance.energy().max(1e-12)) / clear.powi(2)
-            + CONTRAST_FLOOR.powi(2);
+        let variance = self.contrast_noise(clear) + CONTRAST_FLOOR.powi(2);
         // Kalman filter of the contrast: P grows by the walk, gain = certainty P / (P + R).
         self.contrast_variance += (CONTRAST_WALK * self.contrast).powi(2) * interval;
         let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
@@ -113,25 +118,50 @@ impl TargetBelief {
         self.usual_contrast += share * (self.contrast - self.usual_contrast);
     }
 
-    /// Takes into the features what an image shows of the target, before that is learnt.
-    pub(crate) fn take_features(&mut self, contrast: f64, interval: f64) {
-        let clear = f64::from(self.appearance.clear_share());
-        let expected = self.contrast * clear;
-        // Variance v / E of the measured contrast, as a share of the one expected, squared.
-        let energy = f64::from(self.appearance.energy()).max(1e-12);
-        let variance = f64::from(self.noise) / energy / expected.powi(2);
-        let velocity = self.motion.velocity();
-        self.features
-            .take(FeatureSample { contrast: contrast / expected, variance, velocity }, interval);
+    /// Whether another target overlaps this one at a place.
+    fn is_beside_another(&self, place: ImagePoint, frame: FrameInput<'_>) -> bool {
+        let [width, height] = self.appearance.sides();
+        frame.others.any_overlaps(&PixelBox::about(place, width, height))
     }
 
-    /// How the target looks and moves. Its contrast is `sqrt(c^2 k E / (n v))`: see
-    /// `correlation_in_noise`.
-    pub(crate) fn features(&self) -> TargetFeatures {
+    /// Takes into the features what an image shows of the target at a place, before that is learnt.
+    pub(crate) fn take_features(
+        &mut self,
+        contrast: f64,
+        place: ImagePoint,
+        frame: FrameInput<'_>,
+    ) {
+        if self.is_beside_another(place, frame) {
+            return;
+        }
         let clear = f64::from(self.appearance.clear_share());
-        let own = self.contrast.powi(2) * clear * f64::from(self.appearance.energy());
-        let noise = f64::from(self.appearance.pixels() * self.noise).max(f64::MIN_POSITIVE);
-        self.features.features((own / noise).sqrt())
+        let sample = FeatureSample {
+            contrast: contrast / (self.contrast * clear),
+            variance: self.contrast_noise(clear) / self.contrast.powi(2),
+            velocity: self.motion.velocity(),
+        };
+        self.features.take(sample, frame.interval);
+    }
+
+    /// How the target looks and moves. Its contrast is the root of its energy per noise: `sqrt(c^2
+    /// k E / (n v))`, as in `correlation_in_noise`.
+    pub(crate) fn features(&self) -> TargetFeatures {
+        let EnergyInReference { own, noise } = self.energy_in_reference();
+        self.features.features((own / noise.max(f64::MIN_POSITIVE)).sqrt())
+    }
+
+    /// Variance of a contrast that is measured with the reference, of which the share `clear` is
+    /// the target's: `v / (E clear^2)`.
+    fn contrast_noise(&self, clear: f64) -> f64 {
+        f64::from(self.noise / self.appearance.energy().max(1e-12)) / clear.powi(2)
+    }
+
+    fn energy_in_reference(&self) -> EnergyInReference {
+        let clear = f64::from(self.appearance.clear_share());
+        EnergyInReference {
+            own: self.contrast.powi(2) * clear * f64::from(self.appearance.energy()),
+            noise: f64::from(self.appearance.pixels() * self.noise),
+        }
     }
 
     /// The correlation of a reference with the target's next image if only noise separates them:
@@ -139,8 +169,7 @@ impl TargetBelief {
     /// the share k is the target's, the target's contrast c and the image's noise v.
     fn correlation_in_noise(&self) -> f64 {
         let clear = f64::from(self.appearance.clear_share());
-        let own = self.contrast.powi(2) * clear * f64::from(self.appearance.energy());
-        let noise = f64::from(self.appearance.pixels() * self.noise);
+        let EnergyInReference { own, noise } = self.energy_in_reference();
         (clear * own / (own + noise)).sqrt().max(f64::MIN_POSITIVE)
     }
 

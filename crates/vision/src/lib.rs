@@ -126,6 +126,14 @@ impl PixelBox {
             && (self.y..self.y + self.height).contains(&place.y)
     }
 
+    /// Whether the middles of two boxes are apart by no more than half the larger side on either
+    /// axis.
+    pub(crate) fn is_near(&self, other: &Self) -> bool {
+        let (a, b) = (self.centre(), other.centre());
+        (a.x - b.x).abs() <= self.width.max(other.width) / 2.0
+            && (a.y - b.y).abs() <= self.height.max(other.height) / 2.0
+    }
+
     /// Whether two boxes have pixels in common.
     pub(crate) fn overlaps(&self, other: &Self) -> bool {
         let (a, b) = (self.centre(), other.centre());

@@ -143,7 +143,7 @@ impl Sought<'_> {
         let (_, fit) = self.at_full_resolution(frame, searched, place, reach, scratch);
         let has_come = self.has_come(frame, &fit, scratch);
         if let Some(map) = self.memory.map.as_mut().filter(|_| !has_come) {
-            // It belongs to the scene.
+            // It belongs to the scene, or to another target.
             map.places.exclude(cell, near);
         }
         has_come.then_some(fit)
@@ -226,14 +226,17 @@ impl Sought<'_> {
         (peak, fit)
     }
 
-    /// Whether what is found has come to its place, and does not belong to the scene.
+    /// Whether what is found has come to its place, and belongs neither to the scene nor to another
+    /// target, however alike they look.
     fn has_come(
         &mut self,
         frame: FrameInput<'_>,
         found: &TargetFit,
         scratch: &mut Scratch,
     ) -> bool {
-        self.identity.arrival_log_ratio(self.state, frame, found.place, scratch) >= 0.0
+        let is_anothers = frame.others.iter().any(|other| other.holds(found.place));
+        !is_anothers
+            && self.identity.arrival_log_ratio(self.state, frame, found.place, scratch) >= 0.0
     }
 
     /// The map of the target's places, as expected of this image.

@@ -12,7 +12,7 @@ use crate::config::Algorithm;
 use crate::detector::Detector;
 use crate::followed::{Followed, Follower, TakenUpBy, describe};
 use crate::followed_target::LEAST_MOVE_PX;
-use crate::frame::{FrameInput, KnownPlace, Measurement, Others};
+use crate::frame::{FrameInput, Measurement, OtherTarget, Others};
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
 use crate::{
@@ -126,7 +126,7 @@ pub struct ImageTracker {
     pub(crate) followed: Vec<Followed>,
     pub(crate) tracks: Vec<ImageTrack>,
     /// Memory for the places of [`Others`].
-    places: Vec<KnownPlace>,
+    places: Vec<OtherTarget>,
     pub(crate) next_id: u64,
     /// Candidates are numbered down from the largest number; their numbers are never published.
     pub(crate) next_candidate: u64,
@@ -265,21 +265,27 @@ impl ImageTracker {
             .map(|f| f.id)
     }
 
-    /// Notes where each target is expected in the next image, for the others.
-    fn note_places(&mut self, interval: f64, scene_moved: [f64; 2]) {
+    /// Two targets that were taken up on one place are two from when they are apart.
+    fn part_those_apart(&mut self) {
         for index in 0..self.followed.len() {
             let one = &self.followed[index];
             let other = self.followed.iter().find(|other| Some(other.id) == one.began_on);
-            if !other.is_some_and(|other| are_near(&one.target, &other.target, 0.0)) {
+            let here = one.target.box_after(0.0);
+            if !other.is_some_and(|other| other.target.box_after(0.0).is_near(&here)) {
                 self.followed[index].began_on = None;
             }
         }
+    }
+
+    /// Notes where each target is expected in the next image, for the others.
+    fn note_places(&mut self, interval: f64, scene_moved: [f64; 2]) {
         // Where the camera has been jerked nobody knows yet whether the targets have moved with it.
         let is_jerked = scene_moved[0].hypot(scene_moved[1]) >= LEAST_MOVE_PX;
         self.places.clear();
-        self.places.extend(self.followed.iter().map(|followed| KnownPlace {
+        self.places.extend(self.followed.iter().map(|followed| OtherTarget {
             id: followed.id,
             since: followed.since,
+            measured_at: followed.measured_at,
             began_on: followed.began_on,
             place: followed.expected(interval).filter(|_| !is_jerked),
         }));
@@ -287,6 +293,7 @@ impl ImageTracker {
 
     /// Follows all targets into an image, and makes its tracks.
     fn follow(&mut self, image: &Plane, time: Timestamp, interval: f64, scene_moved: [f64; 2]) {
+        self.part_those_apart();
         self.note_places(interval, scene_moved);
         let turn = self.next_sought();
         let frame = FrameInput {
@@ -302,7 +309,7 @@ impl ImageTracker {
         self.tracks.clear();
         for (own, followed) in self.followed.iter_mut().enumerate() {
             let may_search = turn == Some(followed.id);
-            let others = Others { all: &self.places, own, measured_at: followed.measured_at };
+            let others = Others { all: &self.places, own };
             let frame = FrameInput { may_search, others, ..frame };
             if frame.may_search {
                 followed.searched = Some(time);
@@ -408,7 +415,7 @@ impl ImageTracker {
         let mut index = 0;
         while index < self.followed.len() {
             let (older, rest) = self.followed.split_at(index);
-            let is_of = |other: &Followed| lies_on(&other.target, &rest[0].target);
+            let is_of = |other: &Followed| are_one(&other.target, &rest[0].target);
             let is_double = rest[0].origin != TakenUpBy::Given && older.iter().any(is_of);
             let is_known = rest[0].is_candidate()
                 && rest[1..].iter().any(|younger| !younger.is_candidate() && is_of(younger));
@@ -420,11 +427,6 @@ impl ImageTracker {
             }
         }
     }
-}
-
-/// Whether a target lies on another. One that is lost is not where it is guessed to be.
-fn lies_on(one: &Follower, other: &Follower) -> bool {
-    !one.is_searching() && same(one, other)
 }
 
 impl Followed {
@@ -439,16 +441,9 @@ impl Followed {
 /// twice as much two tracks of one target are shown for longer.
 const PARTED_S: f64 = 0.5;
 
-/// Whether two tracks are of one target: they lie on each other, now and in a while.
-fn same(one: &Follower, other: &Follower) -> bool {
-    are_near(one, other, 0.0) && are_near(one, other, PARTED_S)
-}
-
-/// Whether the centres of two targets will be within half a box after this time, s.
-pub(crate) fn are_near(one: &Follower, other: &Follower, after: f64) -> bool {
-    let (a, b) = (one.position(), other.position());
-    let (v, w) = (one.velocity(), other.velocity());
-    let ([aw, ah], [bw, bh]) = (one.size(), other.size());
-    (a.x - b.x + after * (v.x - w.x)).abs() < aw.max(bw) / 2.0
-        && (a.y - b.y + after * (v.y - w.y)).abs() < ah.max(bh) / 2.0
+/// Whether two tracks are of one target: they lie on each other, now and in a while. One that is
+/// lost is not where it is guessed to be.
+fn are_one(older: &Follower, younger: &Follower) -> bool {
+    let are_near = |after| older.box_after(after).is_near(&younger.box_after(after));
+    !older.is_searching() && are_near(0.0) && are_near(PARTED_S)
 }

@@ -3,6 +3,8 @@
 
 use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
 
+use super::LEAST_PLOTS;
+use super::common_motion::MovingThing;
 use super::plots::Plot;
 use crate::ImagePoint;
 
@@ -141,8 +143,12 @@ pub(super) struct Candidate {
     pub(super) plots: u32,
     unseen_s: f64,
     first: [f64; 2],
-    /// Largest distance that it has been from its first place, px.
+    /// Its first place in the image.
+    first_in_image: ImagePoint,
+    /// Largest distance that it has been from its first place, px: in the scene, ...
     pub(super) gone_px: f64,
+    /// ... and in the image.
+    pub(super) gone_in_image_px: f64,
 }
 
 impl Candidate {
@@ -158,7 +164,19 @@ impl Candidate {
             plots: 1,
             unseen_s: 0.0,
             first: place,
+            first_in_image: plot.place,
             gone_px: 0.0,
+            gone_in_image_px: 0.0,
+        }
+    }
+
+    /// How it moves in the image, where the scene is registered as turning by `turning`, px/s.
+    pub(super) fn moving(&self, turning: [f64; 2]) -> MovingThing {
+        let variance = self.axes.iter().map(|axis| axis.covariance().m22).sum::<f64>() / 2.0;
+        MovingThing {
+            place: self.plot.place,
+            velocity: [0, 1].map(|i| self.axes[i].velocity() - turning[i]),
+            sd: variance.sqrt(),
         }
     }
 
@@ -212,6 +230,9 @@ impl Candidate {
         }
         let off = [0, 1].map(|i| self.axes[i].position() - self.first[i]);
         self.gone_px = self.gone_px.max(off[0].hypot(off[1]));
+        let ImagePoint { x, y } = self.first_in_image;
+        self.gone_in_image_px =
+            self.gone_in_image_px.max((plot.place.x - x).hypot(plot.place.y - y));
         // ln (P_D N(innovation; 0, S) / clutter), with P_D the probability of a plot.
         let PlotInnovation { squared, determinant } = innovation;
         let there = -0.5 * squared - (std::f64::consts::TAU * determinant.sqrt()).ln();
@@ -353,6 +374,22 @@ impl Candidates {
         self.clutter.learn(interval);
         self.list.sort_by(|one, other| other.log_ratio().total_cmp(&one.log_ratio()));
         self.list.truncate(KEPT.most);
+    }
+
+    /// Those that are likelier targets than chance, and have plots enough to be found.
+    pub(super) fn likely(&self) -> impl Iterator<Item = &Candidate> {
+        self.list
+            .iter()
+            .filter(|candidate| candidate.plots >= LEAST_PLOTS && candidate.log_ratio() > 0.0)
+    }
+
+    /// Lets the distance of those of which a condition is true count from where they are.
+    pub(super) fn restart_distance_if(&mut self, is_meant: impl Fn(&Candidate) -> bool) {
+        for candidate in self.list.iter_mut().filter(|candidate| is_meant(candidate)) {
+            candidate.first = [0, 1].map(|i| candidate.axes[i].position());
+            candidate.first_in_image = candidate.plot.place;
+            (candidate.gone_px, candidate.gone_in_image_px) = (0.0, 0.0);
+        }
     }
 
     /// Removes the candidates of which a condition is true, and returns them.

@@ -50,7 +50,7 @@ const LEAST_SAMPLES: usize = 100;
 const LEAST_TEXTURED: usize = 40;
 /// The contrast is estimated from cells that stand out by this many spreads. With half of it each
 /// ratio is off by up to a half.
-pub(super) const CONTRAST_SPREADS: f32 = 4.0;
+const CONTRAST_SPREADS: f32 = 4.0;
 /// Range of the contrast: beyond it is another scene, or none. With half of the range a step of the
 /// exposure by two changes every edge.
 const CONTRASTS: [f32; 2] = [0.5, 2.0];
@@ -98,7 +98,7 @@ pub(super) struct Level {
     /// The image's means over the cells.
     pub(super) reduced: Plane,
     stands_out: Plane,
-    lines: StandOutScratch,
+    stand_out_scratch: StandOutScratch,
     /// By how much the background's cells stand out in this image, levels.
     pub(super) now: Plane,
     /// Mean and variance of `now` over the last seconds.
@@ -132,7 +132,7 @@ impl Level {
             cell,
             reduced: Plane::default(),
             stands_out: Plane::default(),
-            lines: StandOutScratch::default(),
+            stand_out_scratch: StandOutScratch::default(),
             now: Plane::default(),
             mean: Plane::default(),
             variance: Plane::default(),
@@ -214,7 +214,7 @@ impl Level {
 
     /// Takes in the image in `reduced`, and learns it except where `known` covers it.
     pub(super) fn see(&mut self, moment: Moment, known: &[Cells]) {
-        stand_out(&self.reduced, &mut self.stands_out, &mut self.lines);
+        stand_out(&self.reduced, &mut self.stands_out, &mut self.stand_out_scratch);
         self.turn(moment);
         if moment.is_first {
             self.mean.copy_from(&self.now);
@@ -320,9 +320,9 @@ impl Level {
         // A camera that is shaken is believed at once, one that is still only later.
         let share = 1.0 - (-interval / STILL_AGAIN_S).exp() as f32;
         self.sway = sway.max(self.sway + share * (sway - self.sway));
-        let sways_most = self.sway_px() >= 0.99 * f64::from(SWAY_PX[1]);
+        let sways_too_far = self.sway_px() >= 0.99 * f64::from(SWAY_PX[1]);
         self.is_lost =
-            is_textured && (sways_most || changed as f32 > MOST_CHANGED * textured as f32);
+            is_textured && (sways_too_far || changed as f32 > MOST_CHANGED * textured as f32);
     }
 
     /// Converts the changes to standard deviations, and learns the background.

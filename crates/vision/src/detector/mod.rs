@@ -7,7 +7,8 @@
 //! noise and the scene's own texture do, by the odds that the configured rate of false finds asks
 //! for. What has been found is followed by its image from then on; in the detector it is covered,
 //! so that it hides nothing and is not learnt as background, and watched: where the background
-//! shows the same, it was the scene.
+//! shows the same, it was the scene. Where most of what moves moves alike ([`common_motion`]), it
+//! is the scene too: the camera turns over one too bare to be registered.
 //!
 //! What comments say of other values of a constant is reasoned or follows by arithmetic, unless
 //! they give shares of frames or of images, or false tracks per minute: those were measured on real
@@ -15,6 +16,7 @@
 
 mod candidates;
 mod cell_update;
+mod common_motion;
 mod filter;
 mod level;
 mod outline;
@@ -22,9 +24,10 @@ mod plots;
 
 use crossfix_correlation::Plane;
 
-use crate::crop::replace_invalid;
+use crate::crop::{paint_over, replace_invalid};
 use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
+use common_motion::{CommonMotion, FoundTarget};
 use filter::{StandOutScratch, between, halve, stand_out};
 use level::{Cells, Level, Moment};
 use plots::Plot;
@@ -45,8 +48,8 @@ const WARM_UP_S: f64 = 0.25;
 const WARM_UP_IMAGES: u32 = 4;
 /// A background that is still being learnt may look like another scene's for this long before it is
 /// begun anew, s: in a clear sky the first image's targets are all of its texture, and as they move
-/// on, that fades from the mean in 0.2 to 0.4 s (of 30 images per second; at 2 or fewer it is begun
-/// anew at once). With half of it such a swarm is found up to 3 s later in a quarter of the skies;
+/// on, that fades from the mean in 0.2 to 0.4 s (of 30 images per second; below 2 it is begun anew
+/// at once). With half of it such a swarm is found up to 3 s later in a quarter of the skies;
 /// with nothing at all hardly ever.
 const MOST_LOST_S: f64 = 0.5;
 /// Fewest plots of a candidate that is found: two always lie on a line, however far apart. With
@@ -92,6 +95,10 @@ const LEAST_NEW: f64 = 0.3;
 /// 0.6, and so is a target that flies in front of its like for as long.
 const NEW_S: f64 = 0.5;
 
+/// Averaging time of the registered turn, s: a jerk of one image is no turn. With half of it a jerk
+/// of 20 px makes all that is in view move at 200 px/s instead of 100.
+const TURN_S: f64 = 0.2;
+
 /// A target that is followed already.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct KnownTarget {
@@ -99,6 +106,8 @@ pub(crate) struct KnownTarget {
     pub(crate) place: PixelBox,
     /// Whether the background at its place is known from before it came.
     pub(crate) is_watched: bool,
+    /// How well its velocity is known, px/s, if the detector has found it.
+    pub(crate) velocity_sd: Option<f64>,
 }
 
 /// A new target.
@@ -137,14 +146,20 @@ pub(crate) struct Detector {
     sides: [usize; 2],
     levels: Vec<Level>,
     images: u32,
-    age_s: f64,
-    /// Whether the background has been learnt for long enough since it was begun.
-    has_warmed: bool,
-    /// How long another scene was in view while it was learnt, and how long none has been, s.
-    lost_s: f64,
+    /// How long the background has been learnt without another scene in view, s.
     settled_s: f64,
+    /// Whether that has been long enough once since it was begun, ...
+    has_warmed: bool,
+    /// ... and for how long another scene was in view before, s.
+    lost_s: f64,
     plots: Vec<Plot>,
     candidates: Candidates,
+    /// `turned` of the last image, px, and a running mean of its change, px/s.
+    turned: [f64; 2],
+    turning: [f64; 2],
+    /// How long most of what moves has moved alike, s.
+    alike_s: f64,
+    found_targets: Vec<FoundTarget>,
     watches: Vec<SceneSuspect>,
 }
 
@@ -155,12 +170,15 @@ impl Detector {
             sides: [0; 2],
             levels: Vec::new(),
             images: 0,
-            age_s: 0.0,
+            settled_s: 0.0,
             has_warmed: false,
             lost_s: 0.0,
-            settled_s: 0.0,
             plots: Vec::new(),
             candidates: Candidates::default(),
+            turned: [0.0; 2],
+            turning: [0.0; 2],
+            alike_s: 0.0,
+            found_targets: Vec::new(),
             watches: Vec::new(),
         }
     }
@@ -183,6 +201,7 @@ impl Detector {
         let Some(finest) = self.levels.first_mut() else { return Findings::default() };
         halve(image, &mut finest.reduced);
         replace_invalid(&mut finest.reduced);
+        self.note_motion(interval, turned, known);
         // How much the known targets stand out is measured before they are painted over.
         self.watch(known);
         for known in known {
@@ -197,14 +216,19 @@ impl Detector {
             }
             return Findings::default();
         }
-        self.settled_s += interval;
-        let scene = self.take_scene(interval);
-        let is_warm = self.age_s.min(self.settled_s) >= WARM_UP_S && self.images > WARM_UP_IMAGES;
-        if is_warm {
-            (self.has_warmed, self.lost_s) = (true, 0.0);
+        if self.images > 1 {
+            self.settled_s += interval;
         }
-        let found = if is_warm { self.find(image, interval, turned, known) } else { Vec::new() };
-        Findings { found, scene }
+        let scene = self.take_scene(interval);
+        let is_warm = self.settled_s >= WARM_UP_S && self.images > WARM_UP_IMAGES;
+        self.has_warmed |= is_warm;
+        let mut findings = Findings { found: Vec::new(), scene };
+        if is_warm {
+            self.plot(interval, turned, known);
+            findings.scene.extend(self.take_common_motion(interval));
+            findings.found = self.find(image, known);
+        }
+        findings
     }
 
     /// Forgets the background and all candidates: the camera points elsewhere.
@@ -212,8 +236,8 @@ impl Detector {
         for level in &mut self.levels {
             *level = Level::new(level.cell());
         }
-        (self.images, self.age_s) = (0, 0.0);
-        (self.has_warmed, self.lost_s, self.settled_s) = (false, 0.0, 0.0);
+        (self.images, self.settled_s) = (0, 0.0);
+        (self.has_warmed, self.lost_s, self.alike_s) = (false, 0.0, 0.0);
         self.candidates = Candidates::default();
         self.watches.clear();
     }
@@ -264,9 +288,6 @@ impl Detector {
                 known.iter().map(|known| cells_of(level, &known.place)).collect();
             level.see(moment, &covered);
         }
-        if self.images > 0 {
-            self.age_s += interval;
-        }
         self.images = self.images.saturating_add(1);
     }
 
@@ -289,16 +310,55 @@ impl Detector {
             .collect()
     }
 
-    fn find(
-        &mut self,
-        image: &Plane,
-        interval: f64,
-        turned: [f64; 2],
-        known: &[KnownTarget],
-    ) -> Vec<Found> {
+    /// Takes the image's plots into the candidates.
+    fn plot(&mut self, interval: f64, turned: [f64; 2], known: &[KnownTarget]) {
         plots::find(&mut self.levels, &mut self.plots);
         self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));
         self.candidates.step(&self.plots, turned, interval, self.sides);
+    }
+
+    /// Notes how the scene turns, as far as it is registered, and how known targets move.
+    fn note_motion(&mut self, interval: f64, turned: [f64; 2], known: &[KnownTarget]) {
+        let share = 1.0 - (-interval / TURN_S).exp();
+        for (turning, (now, before)) in
+            self.turning.iter_mut().zip(turned.into_iter().zip(self.turned))
+        {
+            *turning += share * ((now - before) / interval - *turning);
+        }
+        self.turned = turned;
+        self.found_targets.retain(|found| known.iter().any(|known| known.id == found.id));
+        for known in known {
+            let Some(sd) = known.velocity_sd else { continue };
+            let place = known.place.centre();
+            match self.found_targets.iter_mut().find(|found| found.id == known.id) {
+                Some(found) => found.take(place, sd, interval),
+                None => self.found_targets.push(FoundTarget::new(known.id, place)),
+            }
+        }
+    }
+
+    /// Where most of what moves moves alike, that is the scene: the distance of such candidates
+    /// counts from here, and the targets that have turned out to be the scene are returned.
+    fn take_common_motion(&mut self, interval: f64) -> Vec<ImageTrackId> {
+        // What is registered of a bare scene's turn is a part of it.
+        let turning = self.turning;
+        let candidates = self.candidates.likely().map(|candidate| candidate.moving(turning));
+        let all = self.found_targets.iter().map(|found| found.now).chain(candidates);
+        let Some(scene) = CommonMotion::of(all, self.sides) else {
+            self.alike_s = 0.0;
+            return Vec::new();
+        };
+        self.alike_s += interval;
+        self.candidates.restart_distance_if(|candidate| scene.holds(&candidate.moving(turning)));
+        let alike_s = self.alike_s;
+        self.found_targets
+            .extract_if(.., |found| found.is_scene(&scene, alike_s, interval))
+            .map(|found| found.id)
+            .collect()
+    }
+
+    /// The candidates that are found.
+    fn find(&mut self, image: &Plane, known: &[KnownTarget]) -> Vec<Found> {
         let chances = self.candidates.chances_per_minute().max(LEAST_CHANCES);
         // The odds to beat: chances per minute over the false tracks that are allowed per minute.
         let asked = (chances / self.config.false_tracks_a_minute).ln() + NOT_INDEPENDENT;
@@ -308,9 +368,7 @@ impl Detector {
             place: outline::outline(image, &candidate.plot),
             gone_px: candidate.gone_px,
         });
-        found
-            .filter(|found| !known.iter().any(|known| overlap(&known.place, &found.place)))
-            .collect()
+        found.filter(|found| !known.iter().any(|known| known.place.is_near(&found.place))).collect()
     }
 }
 
@@ -319,9 +377,14 @@ impl Detector {
 fn is_found(candidate: &Candidate, sway_px: f64, asked: f64) -> bool {
     // The two ways in which what stays in its place seems to move: the scene sways, and a plot's
     // place is known to a cell over its strength only.
-    let moved =
-        SWAYS * sway_px + PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
-    candidate.plots >= LEAST_PLOTS && candidate.gone_px > moved && candidate.log_ratio() > asked
+    let place_error = PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
+    let moved = SWAYS * sway_px + place_error;
+    candidate.plots >= LEAST_PLOTS
+        && candidate.gone_px > moved
+        // What is on the lens or written over the picture keeps its place there when the camera
+        // turns.
+        && candidate.gone_in_image_px > place_error
+        && candidate.log_ratio() > asked
 }
 
 /// By how much a place stands out on a scale, computed from the finest scale's means.
@@ -359,36 +422,14 @@ fn cells_of(level: &Level, place: &PixelBox) -> Cells {
     Cells { columns: range(0), rows: range(1) }
 }
 
-/// Paints over a known target, from the pixels left to those right of it, so that it does not hide
-/// what is about it.
+/// Paints over a known target, so that it does not hide what is about it.
 fn cover(reduced: &mut Plane, place: &PixelBox) {
     let sides = [reduced.width(), reduced.height()];
     let cell = CELLS[0] as f64;
     let [first, last] = covered(place).map(|corner| {
         [0, 1].map(|i| (corner[i] / cell).round().clamp(0.0, sides[i] as f64) as usize)
     });
-    if first[0] >= last[0] {
-        return;
-    }
-    let columns = (last[0] - first[0]) as f32;
-    for y in first[1]..last[1] {
-        let row = reduced.row_mut(y);
-        // At the picture's edge there is one side alone; a box from edge to edge has none.
-        let left = first[0].checked_sub(1).map(|x| row[x]);
-        let Some(left) = left.or(row.get(last[0]).copied()) else { continue };
-        let right = row.get(last[0]).copied().unwrap_or(left);
-        for (x, sample) in row[first[0]..last[0]].iter_mut().enumerate() {
-            // Linear from side to side: a flat patch would have edges, which stand out.
-            *sample = left + (right - left) * (x as f32 + 0.5) / columns;
-        }
-    }
-}
-
-/// Whether two boxes' middles are apart by no more than half the larger side on either axis.
-fn overlap(one: &PixelBox, other: &PixelBox) -> bool {
-    let (a, b) = (one.centre(), other.centre());
-    (a.x - b.x).abs() <= one.width.max(other.width) / 2.0
-        && (a.y - b.y).abs() <= one.height.max(other.height) / 2.0
+    paint_over(reduced, &(first[0]..last[0]), first[1]..last[1]);
 }
 
 /// Whether a plot is within a box's sides of its middle, or within two of its own cells.

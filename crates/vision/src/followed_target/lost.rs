@@ -36,10 +36,6 @@ impl ImageTarget {
     fn find_again(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetStep> {
         let Self { state, identity, search_memory: memory, .. } = self;
         let fit = Sought { state, identity, memory }.find(frame, scratch)?;
-        // What another target has is not this one, however alike they look.
-        if frame.others.iter().any(|other| other.holds(fit.place)) {
-            return None;
-        }
         self.identity.begin_probation(&self.state, frame);
         let (found, expected) = (fit.found(), self.state.motion.found());
         if self.state.missed < CONTINUES_IMAGES && are_near(found, expected) {

@@ -21,7 +21,6 @@ use crate::frame::{FrameInput, Measurement, TargetStep};
 use crate::gate::Region;
 use crate::hypotheses::PlaceHypotheses;
 use crate::identity::TargetIdentity;
-use crate::learning::LEARNT_ANYWAY;
 use crate::motion::PlaceEvidence;
 use crate::posterior::Posterior;
 use crate::scratch::Scratch;
@@ -248,7 +247,7 @@ impl ImageTarget {
         self.state.motion.update(&self.evidence(posterior, found, origin, frame.config));
         let (estimate, hidden) = (self.state.position(), posterior.unseen);
         if certainty > SEEN {
-            self.state.take_features(fit.contrast, frame.interval);
+            self.state.take_features(fit.contrast, estimate, frame);
             self.seen(estimate);
             if frame.config.has(TrackerPart::MatchedNoise) {
                 self.state.motion.match_noise(distance);
@@ -313,10 +312,6 @@ impl ImageTarget {
         if self.identity.is_on_probation() {
             return;
         }
-        let [width, height] = self.state.appearance.sides();
-        let is_beside = frame.others.overlap(&PixelBox::about(place, width, height));
-        // Where targets overlap, each one's image is partly the other's.
-        let certainty = if is_beside { LEARNT_ANYWAY * certainty } else { certainty };
         let learnt = self.state.learn(frame, place, fit, certainty, scratch);
         // Several places are those of one reference: while there are, it stays as it is.
         let may_centre = learnt > 0.0 && self.hypotheses.is_empty();
