@@ -28,14 +28,13 @@ pub(crate) fn sky(width: usize, height: usize, seed: u64) -> Vec<f32> {
     for octave in 0..OCTAVES {
         let (cell, strength) = cell_and_strength(octave);
         // Value noise: random values at knots a cell apart, interpolated in between.
-        let columns = width / cell + 2;
-        let knots: Vec<f32> =
-            (0..columns * (height / cell + 2)).map(|_| rng.random::<f32>() * 2.0 - 1.0).collect();
-        for (index, sample) in samples.iter_mut().enumerate() {
-            let (x, y) = (index % width, index / width);
-            let corner = |dx: usize, dy: usize| knots[(y / cell + dy) * columns + x / cell + dx];
-            *sample += strength * between(corner, [x % cell, y % cell], cell);
-        }
+        let [columns, rows] = [width / cell + 2, height / cell + 2];
+        let values = (0..columns * rows).map(|_| rng.random::<f32>() * 2.0 - 1.0).collect();
+        let knots = Knots { values, columns };
+        let [across, down] = [(width, columns), (height, rows)].map(|(side, around)| {
+            (0..side).map(|at| Between::knots(at, cell, around)).collect::<Vec<_>>()
+        });
+        knots.add(strength, &across, &down, &mut samples);
     }
     samples
 }
@@ -55,12 +54,45 @@ fn cell_and_strength(octave: u32) -> (usize, f32) {
     ((COARSEST >> octave).max(2), CLOUDS / (1 << octave) as f32)
 }
 
-/// Interpolates between the knots at the corners of a cell, by smoothstep weights.
-fn between(corner: impl Fn(usize, usize) -> f32, [x, y]: [usize; 2], cell: usize) -> f32 {
-    let [tx, ty] = [x, y].map(|offset| smoothstep(offset as f32 / cell as f32));
-    let upper = corner(0, 0) * (1.0 - tx) + corner(1, 0) * tx;
-    let lower = corner(0, 1) * (1.0 - tx) + corner(1, 1) * tx;
-    upper * (1.0 - ty) + lower * ty
+/// Random values at the knots of an octave, row by row.
+#[derive(Clone, Debug)]
+struct Knots {
+    values: Vec<f32>,
+    columns: usize,
+}
+
+/// Where a pixel lies between two knots of an axis, by smoothstep weights.
+#[derive(Clone, Copy, Debug)]
+struct Between {
+    knots: [usize; 2],
+    weights: [f32; 2],
+}
+
+impl Between {
+    /// For the pixel `at`, with knots a cell apart that repeat after `around` of them.
+    fn knots(at: usize, cell: usize, around: usize) -> Self {
+        let after = smoothstep((at % cell) as f32 / cell as f32);
+        let knot = at / cell;
+        Self { knots: [knot % around, (knot + 1) % around], weights: [1.0 - after, after] }
+    }
+
+    fn of(&self, values: &[f32]) -> f32 {
+        values[self.knots[0]] * self.weights[0] + values[self.knots[1]] * self.weights[1]
+    }
+}
+
+impl Knots {
+    /// Adds the clouds between the knots to an image whose columns and rows lie there.
+    fn add(&self, strength: f32, across: &[Between], down: &[Between], samples: &mut [f32]) {
+        let row = |row: usize| &self.values[row * self.columns..][..self.columns];
+        for (line, down) in samples.chunks_exact_mut(across.len().max(1)).zip(down) {
+            let [above, below] = down.knots.map(row);
+            for (sample, across) in line.iter_mut().zip(across) {
+                let (upper, lower) = (across.of(above), across.of(below));
+                *sample += strength * (upper * down.weights[0] + lower * down.weights[1]);
+            }
+        }
+    }
 }
 
 /// From 0 to 1 as `t` does, level at both ends.
@@ -71,14 +103,15 @@ fn smoothstep(t: f32) -> f32 {
 /// A periodic sky all around, of which a camera that turns sees a part.
 #[derive(Clone, Debug)]
 pub(crate) struct Panorama {
-    octaves: Vec<Vec<f32>>,
+    octaves: Vec<Knots>,
 }
 
 impl Panorama {
     pub(crate) fn new(seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut knots = || (0..PERIOD * PERIOD).map(|_| rng.random::<f32>() * 2.0 - 1.0).collect();
-        Self { octaves: (0..OCTAVES).map(|_| knots()).collect() }
+        let mut values = || (0..PERIOD * PERIOD).map(|_| rng.random::<f32>() * 2.0 - 1.0).collect();
+        let octaves = (0..OCTAVES).map(|_| Knots { values: values(), columns: PERIOD }).collect();
+        Self { octaves }
     }
 
     /// The part that begins `left` pixels to the right of the panorama's origin and `top` pixels
@@ -88,21 +121,14 @@ impl Panorama {
         for (octave, knots) in (0..).zip(&self.octaves) {
             let (cell, strength) = cell_and_strength(octave);
             let around = (cell * PERIOD) as i64;
-            for (index, sample) in samples.iter_mut().enumerate() {
-                let place =
-                    |from: i64, offset: usize| (from + offset as i64).rem_euclid(around) as usize;
-                let (x, y) = (place(left, index % width), place(top, index / width));
-                let corner = |dx, dy| periodic_knot(knots, x / cell + dx, y / cell + dy);
-                *sample += strength * between(corner, [x % cell, y % cell], cell);
-            }
+            let [across, down] = [(left, width), (top, height)].map(|(from, side)| {
+                let places = (0..side as i64).map(|at| (from + at).rem_euclid(around) as usize);
+                places.map(|at| Between::knots(at, cell, PERIOD)).collect::<Vec<_>>()
+            });
+            knots.add(strength, &across, &down, &mut samples);
         }
         samples
     }
-}
-
-/// The knot of a panorama's octave in a column and a row, which repeat.
-fn periodic_knot(knots: &[f32], column: usize, row: usize) -> f32 {
-    knots[row % PERIOD * PERIOD + column % PERIOD]
 }
 
 #[cfg(test)]
