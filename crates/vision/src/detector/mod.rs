@@ -12,7 +12,8 @@
 //!
 //! What comments say of other values of a constant is reasoned or follows by arithmetic, unless
 //! they give shares of frames or of images, or false tracks per minute: those were measured on real
-//! clips of a fixed camera, thermal and visible; a frame is right with a box within 10 px.
+//! clips of a fixed camera, thermal and visible, each when its constant was chosen, so that only
+//! those of one comment compare; a frame is right with a box within 10 px.
 
 mod candidates;
 mod cell_update;
