@@ -42,6 +42,7 @@ mod frame;
 mod gate;
 mod hypotheses;
 mod identity;
+mod jerk;
 mod lanes;
 mod learning;
 mod likelihood;

@@ -2,6 +2,9 @@
 //! that move.
 
 use crossfix_correlation::Plane;
+use pulp::Arch;
+
+use crate::noise::median;
 
 /// Step between the pixels of the smoothed picture that are used, in rows and columns: those
 /// between say the same. With half of it they cost four times as much.
@@ -18,6 +21,16 @@ const LONGEST_STEP: f32 = 2.0;
 /// Difference of brightness beyond which a pixel counts for less, levels: a target that moves is no
 /// turn. With half of it the edges that show a large turn count for less, and it is not reached.
 const OUTLYING: f32 = 5.0;
+/// The same for two images that follow each other, in units of the median difference without a
+/// shift: what is written over the picture stays in its place, and its edges must not outweigh a
+/// faint scene. With half of it most of a scene that turns counts for less.
+const OUTLYING_MEDIANS: f32 = 2.0;
+/// Differences that are summed side by side, for vector instructions. With half of it the sums wait
+/// for each other, and a search costs more.
+const LANES: usize = 16;
+/// Farthest shift of the next image that is searched for, pixels per axis. With half of it a camera
+/// that turns by more than 32 px from one image to the next is not registered.
+const FARTHEST: i32 = 8;
 /// Least reduction of the misfit by a turn, in units of one pixel's mean misfit. Two smoothed
 /// pictures of noise alone fit better by up to 60 at some shift nearby, as only one pixel in
 /// eighteen is independent; with half of it a clear sky turns by chance, with twice as much a turn
@@ -45,9 +58,7 @@ struct RegistrationEquations {
 }
 
 impl RegistrationEquations {
-    fn add(&mut self, [gx, gy]: [f32; 2], off: f32) {
-        // Cauchy's robust weight: 1 / (1 + (off / c)^2).
-        let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
+    fn add(&mut self, weight: f32, [gx, gy]: [f32; 2], off: f32) {
         self.weight += weight;
         self.slope[0] += weight * gx;
         self.slope[1] += weight * gy;
@@ -79,38 +90,160 @@ impl RegistrationEquations {
     }
 }
 
-/// Calls `take` for each pixel in common with its place, the slope of `then`, and the difference of
-/// `now` from `then`, which is shifted by `shift` pixels.
-fn each_off(
-    now: &Plane,
-    then: &Plane,
-    shift: [f32; 2],
-    mut take: impl FnMut([usize; 2], [f32; 2], f32),
-) {
-    let (width, height) = (now.width(), now.height());
-    let whole = shift.map(f32::floor);
-    let [right, down] = [shift[0] - whole[0], shift[1] - whole[1]];
-    let [left, top] = whole.map(|s| s as isize);
-    for y in overlap(height, top).step_by(STRIDE) {
-        let line = now.row(y);
-        let [above, below] = [0, 1].map(|k| then.row((y as isize + top) as usize + k));
-        for x in overlap(width, left).step_by(STRIDE) {
-            let i = (x as isize + left) as usize;
-            let [a, b, c, d] = [above[i], above[i + 1], below[i], below[i + 1]];
-            // Linear interpolation between four pixels, and its derivatives.
-            let [upper, lower] = [a + right * (b - a), c + right * (d - c)];
-            let slope = [(b - a) + down * ((d - c) - (b - a)), lower - upper];
-            // off = now(x) - then(x + shift).
-            take([x, y], slope, line[x] - upper - down * (lower - upper));
-        }
-    }
+/// Two pictures to be registered.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PicturePair<'a> {
+    now: &'a Plane,
+    then: &'a Plane,
+    /// Difference of brightness beyond which a pixel counts for less, levels.
+    outlying: f32,
 }
 
-/// The normal equations of two pictures at a shift, pixels.
-fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> RegistrationEquations {
-    let mut normal = RegistrationEquations::default();
-    each_off(now, then, shift, |_, slope, off| normal.add(slope, off));
-    normal
+impl<'a> PicturePair<'a> {
+    /// A picture and an older one; `None` if their sides differ.
+    pub(crate) fn new(now: &'a Plane, then: &'a Plane) -> Option<Self> {
+        let fit = (then.width(), then.height()) == (now.width(), now.height());
+        fit.then_some(Self { now, then, outlying: OUTLYING })
+    }
+
+    /// A picture and the one before; `None` if their sides differ. `scratch` is memory for the
+    /// differences.
+    pub(crate) fn successive(
+        now: &'a Plane,
+        then: &'a Plane,
+        scratch: &mut Vec<f32>,
+    ) -> Option<Self> {
+        let pair = Self::new(now, then)?;
+        scratch.clear();
+        pair.each_off([0.0; 2], |_, _, off| scratch.push(off.abs()));
+        let outlying = (OUTLYING_MEDIANS * median(scratch)).clamp(f32::MIN_POSITIVE, OUTLYING);
+        Some(Self { outlying, ..pair })
+    }
+
+    /// Cauchy's robust weight, 1 / (1 + (off / c)^2).
+    #[inline(always)]
+    fn weight(&self, off: f32) -> f32 {
+        1.0 / (1.0 + (off / self.outlying).powi(2))
+    }
+
+    /// Calls `take` for each pixel in common with its place, the slope of `then`, and the
+    /// difference of `now` from `then`, which is shifted by `shift` pixels.
+    fn each_off(&self, shift: [f32; 2], mut take: impl FnMut([usize; 2], [f32; 2], f32)) {
+        let Self { now, then, .. } = self;
+        let (width, height) = (now.width(), now.height());
+        let whole = shift.map(f32::floor);
+        let [right, down] = [shift[0] - whole[0], shift[1] - whole[1]];
+        let [left, top] = whole.map(|s| s as isize);
+        for y in overlap(height, top).step_by(STRIDE) {
+            let line = now.row(y);
+            let [above, below] = [0, 1].map(|k| then.row((y as isize + top) as usize + k));
+            for x in overlap(width, left).step_by(STRIDE) {
+                let i = (x as isize + left) as usize;
+                let [a, b, c, d] = [above[i], above[i + 1], below[i], below[i + 1]];
+                // Linear interpolation between four pixels, and its derivatives.
+                let [upper, lower] = [a + right * (b - a), c + right * (d - c)];
+                let slope = [(b - a) + down * ((d - c) - (b - a)), lower - upper];
+                // off = now(x) - then(x + shift).
+                take([x, y], slope, line[x] - upper - down * (lower - upper));
+            }
+        }
+    }
+
+    /// The normal equations at a shift, pixels.
+    fn equations_at(&self, shift: [f32; 2]) -> RegistrationEquations {
+        let mut equations = RegistrationEquations::default();
+        self.each_off(shift, |_, slope, off| equations.add(self.weight(off), slope, off));
+        equations
+    }
+
+    /// The misfits at a shift, pixels, about the mean difference of brightness there.
+    fn misfits(&self, shift: [f32; 2], equations: &RegistrationEquations) -> Misfits {
+        let brighter = equations.off / equations.weight.max(1.0);
+        let sides = [self.now.width(), self.now.height()];
+        let mut tiles = [[TileMisfit::default(); TILES[0]]; TILES[1]];
+        self.each_off(shift, |[x, y], _, off| {
+            let off = off - brighter;
+            let weight = self.weight(off);
+            let tile = &mut tiles[y * TILES[1] / sides[1]][x * TILES[0] / sides[0]];
+            tile.squares += weight * off * off;
+            tile.weights += weight;
+        });
+        Misfits(tiles)
+    }
+
+    /// The whole shift, pixels, at which the pictures fit best, of those searched for.
+    fn nearest(&self) -> [f32; 2] {
+        let steps = || (-FARTHEST..=FARTHEST).map(|step| step as f32);
+        let shifts = steps().flat_map(|down| steps().map(move |right| [right, down]));
+        let misfits = shifts.map(|shift| (self.misfit_at(shift), shift));
+        let best = misfits.min_by(|(one, _), (other, _)| one.total_cmp(other));
+        best.map_or([0.0; 2], |(_, shift)| shift)
+    }
+
+    /// Weighted mean of the squared differences at a whole shift, pixels; infinite if too few
+    /// pixels are in common.
+    fn misfit_at(&self, shift: [f32; 2]) -> f32 {
+        let Self { now, then, .. } = self;
+        let [left, top] = shift.map(|s| s as isize);
+        let [columns, rows] = [overlap(now.width(), left), overlap(now.height(), top)];
+        if columns.is_empty() || rows.is_empty() {
+            return f32::INFINITY;
+        }
+        let first = columns.start.wrapping_add_signed(left);
+        let (mut squares, mut weights) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+        // All columns, not every second one: many are computed at a time.
+        Arch::new().dispatch(|| {
+            for y in rows.step_by(STRIDE) {
+                let line = &now.row(y)[columns.clone()];
+                let older = &then.row(y.wrapping_add_signed(top))[first..first + line.len()];
+                for (now, then) in line.chunks(LANES).zip(older.chunks(LANES)) {
+                    let sums = squares.iter_mut().zip(&mut weights);
+                    for ((squares, weights), (now, then)) in sums.zip(now.iter().zip(then)) {
+                        let off = now - then;
+                        let weight = self.weight(off);
+                        *squares += weight * off * off;
+                        *weights += weight;
+                    }
+                }
+            }
+        });
+        let all = TileMisfit { squares: squares.iter().sum(), weights: weights.iter().sum() };
+        if all.weights < LEAST_COMMON { f32::INFINITY } else { all.mean() }
+    }
+
+    /// The shift against the older picture, pixels, from a first guess. `None` where it explains no
+    /// more than noise would, or than a target that moves: a clear sky shows no turn.
+    pub(crate) fn shift_near(&self, first: [f32; 2]) -> Option<[f32; 2]> {
+        let (shift, after) = self.iterated(first)?;
+        after.are_better_than(&self.misfits(first, &self.equations_at(first))).then_some(shift)
+    }
+
+    /// The shift since the image before, pixels, up to `FARTHEST`. `None` where most of the image
+    /// does not show it.
+    pub(crate) fn step(&self) -> Option<[f32; 2]> {
+        let (shift, after) = self.iterated(self.nearest())?;
+        // Compared with the opposite shift: between pixels noise alone fits better than on them,
+        // and this one lies between them alike.
+        let opposite = shift.map(|by| -by);
+        let before = self.misfits(opposite, &self.equations_at(opposite));
+        after.are_better_in_most(&before).then_some(shift)
+    }
+
+    /// The shift to which the registration leads from a start (Lucas and Kanade 1981), with the
+    /// misfits there; `None` where the pictures do not determine it.
+    fn iterated(&self, start: [f32; 2]) -> Option<([f32; 2], Misfits)> {
+        let mut shift = start;
+        let mut equations = self.equations_at(shift);
+        for _ in 0..STEPS {
+            let [x, y] = equations.step()?;
+            shift = [shift[0] + x, shift[1] + y];
+            equations = self.equations_at(shift);
+            if x.abs() + y.abs() < SETTLED {
+                break;
+            }
+        }
+        Some((shift, self.misfits(shift, &equations)))
+    }
 }
 
 /// Columns and rows of the tiles into which a picture is divided, to distinguish a turn from a
@@ -126,6 +259,11 @@ const AROUND: usize = 2;
 /// edges of a large target's smoothed picture reach a twentieth that far. With half of it those
 /// alone are enough.
 const ELSEWHERE: f32 = 0.1;
+
+/// By how many standard deviations more tiles must fit better than worse, where a shift was
+/// searched for: of some hundred shifts the best lies three above what chance makes of one. With
+/// half of it a clear sky turns by chance (reasoned, not measured).
+const MOST_TILES_SDS: f32 = 4.0;
 
 /// How badly two pictures fit in one tile, or in several together.
 #[derive(Clone, Copy, Debug, Default)]
@@ -153,21 +291,6 @@ impl TileMisfit {
 struct Misfits([[TileMisfit; TILES[0]]; TILES[1]]);
 
 impl Misfits {
-    /// The misfits of two pictures at a shift, pixels, if the newer one is brighter by `brighter`
-    /// levels.
-    fn at(now: &Plane, then: &Plane, shift: [f32; 2], brighter: f32) -> Self {
-        let sides = [now.width(), now.height()];
-        let mut tiles = [[TileMisfit::default(); TILES[0]]; TILES[1]];
-        each_off(now, then, shift, |[x, y], _, off| {
-            let off = off - brighter;
-            let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
-            let tile = &mut tiles[y * TILES[1] / sides[1]][x * TILES[0] / sides[0]];
-            tile.squares += weight * off * off;
-            tile.weights += weight;
-        });
-        Self(tiles)
-    }
-
     /// Whether these misfits are less than `before` by more than noise makes them, and also away
     /// from the two tiles that have gained most: a target may be in one of these, and have been in
     /// the other.
@@ -181,6 +304,16 @@ impl Misfits {
         let first = self.most_gained(before, &[]);
         let second = self.most_gained(before, &[first]);
         self.gain(before, &[first, second]) > ELSEWHERE * whole
+    }
+
+    /// Whether these misfits are less than `before` in so many more tiles than they are larger in
+    /// that chance does not make it: a scene fills most of the image, and targets do not, however
+    /// many.
+    fn are_better_in_most(&self, before: &Self) -> bool {
+        let gains = tiles().map(|[x, y]| self.0[y][x].gain(before.0[y][x]));
+        let signs: f32 = gains.map(|gain| if gain > 0.0 { 1.0 } else { -1.0 }).sum();
+        // By chance the sum of n signs has the variance n.
+        signs > MOST_TILES_SDS * ((TILES[0] * TILES[1]) as f32).sqrt()
     }
 
     /// The misfit of all tiles together that are not near `others`.
@@ -219,29 +352,4 @@ fn tiles_apart_from(others: &[[usize; 2]]) -> impl Iterator<Item = [usize; 2]> {
 
 fn is_about([x, y]: [usize; 2], [column, row]: [usize; 2]) -> bool {
     x.abs_diff(column) <= AROUND && y.abs_diff(row) <= AROUND
-}
-
-/// Shift of a picture against an older one, px, iterated from a first guess (Lucas and Kanade
-/// 1981). `None` where the shift explains no more than noise would, or than a target that moves: a
-/// clear sky shows no turn.
-pub(crate) fn registered(now: &Plane, then: &Plane, first: [f32; 2]) -> Option<[f32; 2]> {
-    if (then.width(), then.height()) != (now.width(), now.height()) {
-        return None;
-    }
-    let mut shift = first;
-    let mut normal = normal_at(now, then, shift);
-    let brighter = |normal: &RegistrationEquations| normal.off / normal.weight.max(1.0);
-    // Mean difference of brightness at the first guess; the misfit there is computed without it.
-    let before = brighter(&normal);
-    for _ in 0..STEPS {
-        let [x, y] = normal.step()?;
-        shift = [shift[0] + x, shift[1] + y];
-        normal = normal_at(now, then, shift);
-        if x.abs() + y.abs() < SETTLED {
-            break;
-        }
-    }
-    let before = Misfits::at(now, then, first, before);
-    let after = Misfits::at(now, then, shift, brighter(&normal));
-    after.are_better_than(&before).then_some(shift)
 }

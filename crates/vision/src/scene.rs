@@ -9,8 +9,8 @@ use pulp::{Arch, Simd, WithSimd};
 
 use crate::ImagePoint;
 use crate::crop::replace_invalid;
-use crate::noise::median;
-use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
+use crate::jerk::RowGlance;
+use crate::registration::{LEAST_COMMON, PicturePair, STRIDE, overlap};
 
 /// Number of pictures that are kept, the latest: they reach back for 3 to 3.6 s. With half of it a
 /// slow target hides the same part of the scene in all of them; with more, light and clouds are
@@ -25,7 +25,7 @@ const CHANGED_S: f64 = 1.0;
 /// Side of the blocks that make one pixel of the coarse picture, px; the camera's turn is found in
 /// that. In single pixels the noise has more slope than clouds have, and no turn is noticed; with
 /// half of it the noise of a block is twice as large, and faint clouds show no turn.
-const COARSENESS: usize = 8;
+pub(crate) const COARSENESS: usize = 8;
 /// How often the coarse picture is smoothed, each time with weights of a quarter, a half and a
 /// quarter for neighbours. With half of it noise keeps more of its slope, against the scene's.
 const SMOOTHED: usize = 3;
@@ -37,20 +37,9 @@ const STILL_PX: f64 = 0.1;
 /// registered.
 const STILL_S: f64 = 0.1;
 
-/// The change from one image to the next that shows that the camera is jerked.
-struct Jerk {
-    /// Factor above the usual change. With half of it every image is a jerk whose usual change
-    /// exceeds a level.
-    factor: f32,
-    /// Levels above that. With half of it so is a flicker of an eighth of a level.
-    levels: f32,
-    /// Time constant of the running mean that is the usual change, s. With half of it a jerk counts
-    /// twice as much in what is usual after it.
-    usual_s: f64,
-}
-
-/// The numbers in use; what half of each does is said at its field.
-const JERK: Jerk = Jerk { factor: 1.5, levels: 0.25, usual_s: 0.65 };
+/// Least turn from one image to the next that is believed where no picture shows it, px: waves and
+/// clouds move by less. With half of it a sea is registered along the way of its waves.
+const LEAST_STEP_PX: f64 = 2.0;
 
 /// A picture of the scene.
 #[derive(Clone, Debug, Default)]
@@ -90,58 +79,15 @@ impl ScenePicture {
     }
 }
 
-/// Of this many blocks along a row one is compared: there are hundreds, and a jerk has to change
-/// half of them. With half of it the glance costs twice as much and shows the same.
-const GLANCED: usize = 4;
-
-/// One row of some blocks, by which a jerk of the camera is noticed at a tenth of the cost of a
-/// registration.
-#[derive(Debug, Default)]
-struct RowGlance {
-    /// Mean of one row of each of these blocks, in the last image.
-    means: Vec<f32>,
-    changes: Vec<f32>,
-    /// Usual median change of these means from image to image, levels.
-    usual: f32,
-}
-
-impl RowGlance {
-    /// Whether most of the image has changed since the image before, by more than noise.
-    fn is_another(&mut self, image: &Plane, interval: f64) -> bool {
-        let Self { means, changes, usual } = self;
-        let rows = (COARSENESS / 2..image.height()).step_by(COARSENESS);
-        let blocks =
-            rows.flat_map(|y| image.row(y).as_chunks::<COARSENESS>().0.iter().step_by(GLANCED));
-        let now = blocks.map(|block| block.iter().sum::<f32>() / COARSENESS as f32);
-        changes.clear();
-        if means.is_empty() {
-            means.extend(now);
-            return true;
-        }
-        for (before, now) in means.iter_mut().zip(now) {
-            let change = (now - *before).abs();
-            *before = now;
-            // Broken samples say nothing.
-            if change.is_finite() {
-                changes.push(change);
-            }
-        }
-        // The median of the changes: targets change a few blocks, a jerk most of them.
-        let change = median(changes);
-        let is_jerk = change > JERK.factor * *usual + JERK.levels;
-        // A jerk enters the usual change only as far as the threshold.
-        let share = (1.0 - (-interval / JERK.usual_s).exp()) as f32;
-        *usual += share * (change.min(JERK.factor * *usual + JERK.levels) - *usual);
-        is_jerk
-    }
-}
-
 /// The last seconds' pictures.
 #[derive(Debug, Default)]
 pub(crate) struct SceneMemory {
     /// The newest first.
     pictures: Vec<ScenePicture>,
     coarse: Plane,
+    /// What `coarse` was before it was smoothed, and that of the image registered before.
+    sharp: Plane,
+    last: Plane,
     between: Plane,
     sums: Vec<f32>,
     /// Number of pictures kept since the beginning.
@@ -184,6 +130,7 @@ impl SceneMemory {
         self.turned = self.turned();
         self.pictures.clear();
         (self.glance, self.is_still) = (RowGlance::default(), false);
+        self.sharp = Plane::default();
     }
 
     /// Finds how the camera has turned by registering the image with the newest picture; against
@@ -207,11 +154,15 @@ impl SceneMemory {
         self.unregistered_s = 0.0;
         coarsened(image, &mut self.coarse, &mut self.sums);
         replace_invalid(&mut self.coarse);
+        std::mem::swap(&mut self.last, &mut self.sharp);
+        self.sharp.copy_from(&self.coarse);
         smooth(&mut self.coarse, &mut self.between);
+        let step = (is_jerked || !self.is_still).then(|| self.step()).flatten();
         let Some((newest, others)) = self.pictures.split_first_mut() else { return };
         let before = newest.shift;
         if !self.is_unregistered {
-            newest.shift = turned(&self.coarse, &newest.coarse, before);
+            let guess = step.map_or(before, |step| [0, 1].map(|i| before[i] + step[i]));
+            newest.shift = turned(&self.coarse, &newest.coarse, guess).unwrap_or(guess);
         }
         self.is_still =
             newest.shift.iter().zip(before).all(|(now, before)| (now - before).abs() < STILL_PX);
@@ -225,6 +176,15 @@ impl SceneMemory {
         }
     }
 
+    /// By how much the camera has turned since the image that was registered last, px: the kept
+    /// pictures show a large turn only near a first guess, and that of a scene which is fine or
+    /// changes quickly not at all.
+    fn step(&mut self) -> Option<[f64; 2]> {
+        let pair = PicturePair::successive(&self.sharp, &self.last, &mut self.sums)?;
+        let step = pair.step()?.map(|step| f64::from(step) * COARSENESS as f64);
+        (step[0].hypot(step[1]) > LEAST_STEP_PX).then_some(step)
+    }
+
     /// Keeps a picture if it is time to, and returns its number.
     pub(crate) fn keep(&mut self, image: &Plane) -> Option<u64> {
         let is_new = self.pictures.first().is_some_and(|newest| newest.age_s < SPACING_S);
@@ -235,7 +195,8 @@ impl SceneMemory {
         // Each picture is registered itself, so that errors do not add up from picture to picture.
         if !self.is_unregistered {
             for picture in &mut self.pictures {
-                picture.shift = turned(&self.coarse, &picture.coarse, picture.shift);
+                picture.shift =
+                    turned(&self.coarse, &picture.coarse, picture.shift).unwrap_or(picture.shift);
             }
         }
         self.turned = self.turned();
@@ -290,13 +251,14 @@ impl SceneMemory {
     }
 }
 
-/// By how much the camera has turned between two coarse pictures, px of the image; `before` where
-/// they determine no turn.
-fn turned(now: &Plane, then: &Plane, before: [f64; 2]) -> [f64; 2] {
+/// By how much the camera has turned between two coarse pictures, px of the image, if they
+/// determine it; `before` is what was known.
+fn turned(now: &Plane, then: &Plane, before: [f64; 2]) -> Option<[f64; 2]> {
     let coarseness = COARSENESS as f64;
     // From the last shift on: registration finds only shifts near its first guess.
-    let found = registered(now, then, before.map(|turned| (turned / coarseness) as f32));
-    found.map_or(before, |turned| turned.map(|turned| f64::from(turned) * coarseness))
+    let before = before.map(|turned| (turned / coarseness) as f32);
+    let found = PicturePair::new(now, then)?.shift_near(before)?;
+    Some(found.map(|turned| f64::from(turned) * coarseness))
 }
 
 /// The means of blocks. `sums` is memory for a row of them.
@@ -366,7 +328,9 @@ fn smooth(plane: &mut Plane, between: &mut Plane) {
 
 #[cfg(test)]
 mod tests {
-    use rand::SeedableRng;
+    use std::f64::consts::TAU;
+
+    use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, Normal};
 
@@ -470,6 +434,57 @@ mod tests {
             .flat_map(|y| &change.row(y)[20..290])
             .fold(0.0, |most: f32, c| most.max(c.abs()));
         assert!(worst < 8.0, "{worst}");
+    }
+
+    /// Waves of 12 to 40 px, which are others after a quarter of a second, and signs written over
+    /// the picture.
+    fn waves(right: f64, time_s: f64) -> Plane {
+        let mut rng = ChaCha8Rng::seed_from_u64(11);
+        let waves: Vec<[f64; 4]> = (0..16)
+            .map(|_| {
+                let [length, way] = [rng.random_range(12.0..40.0), rng.random_range(0.0..TAU)];
+                let number = TAU / length;
+                let speed = rng.random_range(-6.0..6.0);
+                [number * f64::cos(way), number * f64::sin(way), speed, rng.random_range(0.0..TAU)]
+            })
+            .collect();
+        let mut image = Plane::from_fn(640, 480, |x, y| {
+            let height = |[along, down, speed, phase]: &[f64; 4]| {
+                (along * (x as f64 + right) + down * y as f64 + speed * time_s + phase).sin()
+            };
+            120.0 + 5.0 * waves.iter().map(height).sum::<f64>() as f32
+        });
+        for y in 12..28 {
+            let row = image.row_mut(y);
+            (20..600).filter(|x| x % 16 < 8).for_each(|x| row[x] = 250.0);
+        }
+        image
+    }
+
+    #[test]
+    fn a_turn_over_waves_is_found_from_image_to_image_and_the_waves_are_no_turn() {
+        let mut scene = SceneMemory::default();
+        let mut image = |seconds: f64, right: f64| {
+            let image = waves(right, seconds);
+            scene.register(&image, 1.0 / 30.0);
+            scene.keep(&image);
+            scene.turned()
+        };
+        let mut before = [0.0; 2];
+        for frame in 0..15 {
+            before = image(f64::from(frame) / 30.0, 0.0);
+        }
+        assert!(
+            before[0].hypot(before[1]) < 12.0,
+            "what the waves themselves have moved: {before:?}"
+        );
+        for frame in 15..35 {
+            let right = 20.0 * f64::from((frame - 14).min(10));
+            let turned = image(f64::from(frame) / 30.0, right);
+            // The pictures alone show 21 of the 200 px.
+            let off = [turned[0] - before[0] - right, turned[1] - before[1]];
+            assert!(off[0].hypot(off[1]) < 20.0, "image {frame}: {turned:?}");
+        }
     }
 
     #[test]

@@ -269,6 +269,45 @@ fn a_camera_that_turns_away_finds_nothing_in_the_turn_and_the_target_after_it() 
     assert!(seen >= 28, "in {seen} of 30 images");
 }
 
+/// A reticle of lines, written over the picture.
+fn with_reticle(mut image: Plane) -> Plane {
+    for y in (40..80).chain(160..200) {
+        for x in [60, 61, 258, 259] {
+            image.row_mut(y)[x] = 250.0;
+        }
+    }
+    for y in [119, 120] {
+        image.row_mut(y)[20..60].fill(250.0);
+        image.row_mut(y)[260..300].fill(250.0);
+    }
+    image
+}
+
+#[test]
+fn what_is_written_over_the_picture_is_not_found_when_the_camera_turns() {
+    fn turning(x: f64, y: f64, time_s: f64) -> f64 {
+        let turned = 40.0 * (time_s - 1.0).max(0.0);
+        clouds(x + turned, y, 0.0) + 20.0 * ((x + turned) * 0.4).sin() * (y * 0.5).cos()
+    }
+    let mut world = World::new(320, 240, 2.0, turning, 23);
+    let spot = |time_s: f64| Spot {
+        x: 300.0 - 50.0 * (time_s - 2.0),
+        y: 140.0,
+        spread: [4.0, 3.0],
+        brighter: 100.0,
+    };
+    let (mut tracker, mut seen) = (tracker(), 0);
+    for frame in 0..180 {
+        let time_s = f64::from(frame) / RATE_HZ;
+        let image = with_reticle(world.image(time_s, &from(2.0, spot)(time_s)));
+        let tracks = tracker.step(&image, Timestamp::from_seconds(time_s));
+        let is_there = tracks.iter().all(|track| is_at(track, &spot(time_s), 12.0));
+        assert!(is_there, "at {time_s}: {tracks:?}");
+        seen += usize::from(time_s >= 3.0 && !tracks.is_empty());
+    }
+    assert!(seen >= 85, "in {seen} of 90 images");
+}
+
 /// A mount has turned the camera: the target is another place of another scene, and what was
 /// followed before is no track there.
 #[test]

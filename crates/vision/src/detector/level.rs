@@ -55,6 +55,12 @@ const CONTRAST_SPREADS: f32 = 4.0;
 /// exposure by two changes every edge.
 const CONTRASTS: [f32; 2] = [0.5, 2.0];
 
+/// What stands out is on the lens if the mean of what has kept its place in the image lacks less of
+/// it than this share of what the background lacks. With half of it lines behind which the scene
+/// changes are found; with twice as much a target that a turning camera keeps nearly in its place
+/// is refused.
+const LENS: f32 = 0.35;
+
 /// Time and camera direction of an image, for the background.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Moment {
@@ -104,6 +110,8 @@ pub(super) struct Level {
     /// Mean and variance of `now` over the last seconds.
     mean: Plane,
     variance: Plane,
+    /// Mean of `stands_out`: what keeps its place in the image, however the camera turns.
+    on_lens: Plane,
     /// Change of this image from the mean, standard deviations; 0 where a known target is.
     pub(super) change: Plane,
     /// Shift of the background against the image, cells: the whole ones, and the rest.
@@ -136,6 +144,7 @@ impl Level {
             now: Plane::default(),
             mean: Plane::default(),
             variance: Plane::default(),
+            on_lens: Plane::default(),
             change: Plane::default(),
             whole: [0; 2],
             rest: [0.0; 2],
@@ -188,6 +197,17 @@ impl Level {
         if now == 0.0 { 0.0 } else { 1.0 - self.contrast * self.mean.row(y)[x] / now }
     }
 
+    /// Whether what stands out at a cell is on the lens, or written over the picture: what has kept
+    /// its place in the image explains it, and the background does not. While the camera has not
+    /// turned the two say the same, and this is false.
+    pub(super) fn is_on_lens(&self, [x, y]: [usize; 2]) -> bool {
+        let now = self.now.row(y)[x];
+        // The background's cell (x, y) lies at (x, y) - rest in the image's cells.
+        let at = [x as f32 - self.rest[0], y as f32 - self.rest[1]].map(f64::from);
+        let of_lens = (now - between(&self.on_lens, at)).abs();
+        of_lens < LENS * (now - self.contrast * self.mean.row(y)[x]).abs()
+    }
+
     /// Least strength of something that is not noise, in spreads.
     pub(super) fn least_strength(&self) -> f32 {
         // (1 + p) / (1 - p), p the persistence: see `MOST_LASTING`.
@@ -215,6 +235,7 @@ impl Level {
     /// Takes in the image in `reduced`, and learns it except where `known` covers it.
     pub(super) fn see(&mut self, moment: Moment, known: &[Cells]) {
         stand_out(&self.reduced, &mut self.stands_out, &mut self.stand_out_scratch);
+        self.learn_lens(moment, known);
         self.turn(moment);
         if moment.is_first {
             self.mean.copy_from(&self.now);
@@ -226,6 +247,21 @@ impl Level {
         }
         self.learn(moment.share, known);
         self.remember_changes();
+    }
+
+    /// Takes the image into the mean of what keeps its place in it, except where `known` covers it.
+    fn learn_lens(&mut self, Moment { share, is_first, .. }: Moment, known: &[Cells]) {
+        if is_first {
+            self.on_lens.copy_from(&self.stands_out);
+        }
+        let (width, height) = (self.on_lens.width(), self.on_lens.height());
+        for y in 0..height {
+            let (mean, now) = (self.on_lens.row_mut(y), self.stands_out.row(y));
+            for [from, to] in free_of(known, y, width) {
+                let cells = mean[from..to].iter_mut().zip(&now[from..to]);
+                cells.for_each(|(mean, now)| *mean += share * (now - *mean));
+            }
+        }
     }
 
     /// Moves the background with the scene.

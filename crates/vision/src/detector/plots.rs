@@ -122,6 +122,7 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
     let share = level.new_share(top);
     if strength < level.least_strength().max(LEAST_OF_CHANGE * change.abs())
         || !(SHARES[0]..SHARES[1]).contains(&share)
+        || level.is_on_lens(top)
     {
         return None;
     }
