@@ -2,8 +2,8 @@
 
 use crossfix_correlation::Plane;
 
+use crate::coarse_picture::COARSENESS;
 use crate::noise::median;
-use crate::scene::COARSENESS;
 
 /// The change from one image to the next that shows that the camera is jerked.
 struct Jerk {
@@ -20,7 +20,7 @@ struct Jerk {
 /// The numbers in use; what half of each does is said at its field.
 const JERK: Jerk = Jerk { factor: 1.5, levels: 0.25, usual_s: 0.65 };
 
-/// Of this many blocks along a row one is compared: there are hundreds, and a jerk has to change
+/// Of this many blocks of the coarse picture along a row one is compared: there are hundreds, and a jerk has to change
 /// half of them. With half of it the glance costs twice as much and shows the same.
 const GLANCED: usize = 4;
 
@@ -36,7 +36,8 @@ pub(crate) struct RowGlance {
 }
 
 impl RowGlance {
-    /// Whether most of the image has changed since the image before, by more than noise.
+    /// Whether most of the image has changed since the image before, by more than noise. True for
+    /// the first image.
     pub(crate) fn is_another(&mut self, image: &Plane, interval: f64) -> bool {
         let Self { means, changes, usual } = self;
         let rows = (COARSENESS / 2..image.height()).step_by(COARSENESS);
@@ -58,10 +59,10 @@ impl RowGlance {
         }
         // The median of the changes: targets change a few blocks, a jerk most of them.
         let change = median(changes);
-        let is_jerk = change > JERK.factor * *usual + JERK.levels;
+        let most = JERK.factor * *usual + JERK.levels;
         // A jerk enters the usual change only as far as the threshold.
         let share = (1.0 - (-interval / JERK.usual_s).exp()) as f32;
-        *usual += share * (change.min(JERK.factor * *usual + JERK.levels) - *usual);
-        is_jerk
+        *usual += share * (change.min(most) - *usual);
+        change > most
     }
 }

@@ -29,6 +29,7 @@ mod appearance;
 mod arrival;
 mod centring;
 mod coarse;
+mod coarse_picture;
 mod config;
 mod crop;
 mod detector;

@@ -6,8 +6,8 @@ use pulp::Arch;
 
 use crate::noise::median;
 
-/// Step between the pixels of the smoothed picture that are used, in rows and columns: those
-/// between say the same. With half of it they cost four times as much.
+/// Step between the pixels that are used, in rows and columns: of a smoothed picture those between
+/// say the same. With half of it they cost four times as much.
 pub(crate) const STRIDE: usize = 2;
 /// Most iterations of the registration. With half of it a shift of more than three of the longest
 /// steps is not reached.
@@ -22,14 +22,18 @@ const LONGEST_STEP: f32 = 2.0;
 /// turn. With half of it the edges that show a large turn count for less, and it is not reached.
 const OUTLYING: f32 = 5.0;
 /// The same for two images that follow each other, in units of the median difference without a
-/// shift: what is written over the picture stays in its place, and its edges must not outweigh a
-/// faint scene. With half of it most of a scene that turns counts for less.
+/// shift, and at most `OUTLYING`: what is written over the picture stays in its place, and its edges
+/// must not outweigh a faint scene. With half of it most of a scene that turns counts for less.
 const OUTLYING_MEDIANS: f32 = 2.0;
+/// It is at least this, levels: where more than half of the image is without noise, as a sky that
+/// is too bright, the median is 0. With half of it the noise of blocks counts as outlying.
+const LEAST_OUTLYING: f32 = 0.5;
 /// Differences that are summed side by side, for vector instructions. With half of it the sums wait
 /// for each other, and a search costs more.
 const LANES: usize = 16;
-/// Farthest shift of the next image that is searched for, pixels per axis. With half of it a camera
-/// that turns by more than 32 px from one image to the next is not registered.
+/// Farthest shift of the next image that is searched for, pixels of a coarse picture per axis, of 8
+/// px of the image each: 64 px. With half of it no faster turn than 32 px from one image to the
+/// next is found over waves, and 0.1 s of a slow one.
 const FARTHEST: i32 = 8;
 /// Least reduction of the misfit by a turn, in units of one pixel's mean misfit. Two smoothed
 /// pictures of noise alone fit better by up to 60 at some shift nearby, as only one pixel in
@@ -97,13 +101,15 @@ pub(crate) struct PicturePair<'a> {
     then: &'a Plane,
     /// Difference of brightness beyond which a pixel counts for less, levels.
     outlying: f32,
+    /// By how much the newer one is brighter, levels, where that is known beforehand.
+    brighter: f32,
 }
 
 impl<'a> PicturePair<'a> {
     /// A picture and an older one; `None` if their sides differ.
     pub(crate) fn new(now: &'a Plane, then: &'a Plane) -> Option<Self> {
         let fit = (then.width(), then.height()) == (now.width(), now.height());
-        fit.then_some(Self { now, then, outlying: OUTLYING })
+        fit.then_some(Self { now, then, outlying: OUTLYING, brighter: 0.0 })
     }
 
     /// A picture and the one before; `None` if their sides differ. `scratch` is memory for the
@@ -115,9 +121,11 @@ impl<'a> PicturePair<'a> {
     ) -> Option<Self> {
         let pair = Self::new(now, then)?;
         scratch.clear();
-        pair.each_off([0.0; 2], |_, _, off| scratch.push(off.abs()));
-        let outlying = (OUTLYING_MEDIANS * median(scratch)).clamp(f32::MIN_POSITIVE, OUTLYING);
-        Some(Self { outlying, ..pair })
+        pair.each_off([0.0; 2], |_, _, off| scratch.push(off));
+        let brighter = median(scratch);
+        scratch.iter_mut().for_each(|off| *off = (*off - brighter).abs());
+        let outlying = (OUTLYING_MEDIANS * median(scratch)).clamp(LEAST_OUTLYING, OUTLYING);
+        Some(Self { outlying, brighter, ..pair })
     }
 
     /// Cauchy's robust weight, 1 / (1 + (off / c)^2).
@@ -152,7 +160,9 @@ impl<'a> PicturePair<'a> {
     /// The normal equations at a shift, pixels.
     fn equations_at(&self, shift: [f32; 2]) -> RegistrationEquations {
         let mut equations = RegistrationEquations::default();
-        self.each_off(shift, |_, slope, off| equations.add(self.weight(off), slope, off));
+        self.each_off(shift, |_, slope, off| {
+            equations.add(self.weight(off - self.brighter), slope, off);
+        });
         equations
     }
 
@@ -172,9 +182,9 @@ impl<'a> PicturePair<'a> {
     }
 
     /// The whole shift, pixels, at which the pictures fit best, of those searched for.
-    fn nearest(&self) -> [f32; 2] {
-        let steps = || (-FARTHEST..=FARTHEST).map(|step| step as f32);
-        let shifts = steps().flat_map(|down| steps().map(move |right| [right, down]));
+    fn best_whole_shift(&self) -> [f32; 2] {
+        let along = || (-FARTHEST..=FARTHEST).map(|by| by as f32);
+        let shifts = along().flat_map(|down| along().map(move |right| [right, down]));
         let misfits = shifts.map(|shift| (self.misfit_at(shift), shift));
         let best = misfits.min_by(|(one, _), (other, _)| one.total_cmp(other));
         best.map_or([0.0; 2], |(_, shift)| shift)
@@ -199,7 +209,7 @@ impl<'a> PicturePair<'a> {
                 for (now, then) in line.chunks(LANES).zip(older.chunks(LANES)) {
                     let sums = squares.iter_mut().zip(&mut weights);
                     for ((squares, weights), (now, then)) in sums.zip(now.iter().zip(then)) {
-                        let off = now - then;
+                        let off = now - then - self.brighter;
                         let weight = self.weight(off);
                         *squares += weight * off * off;
                         *weights += weight;
@@ -214,14 +224,16 @@ impl<'a> PicturePair<'a> {
     /// The shift against the older picture, pixels, from a first guess. `None` where it explains no
     /// more than noise would, or than a target that moves: a clear sky shows no turn.
     pub(crate) fn shift_near(&self, first: [f32; 2]) -> Option<[f32; 2]> {
-        let (shift, after) = self.iterated(first)?;
-        after.are_better_than(&self.misfits(first, &self.equations_at(first))).then_some(shift)
+        let at_first = self.equations_at(first);
+        let (shift, after) = self.iterated(first, at_first)?;
+        after.are_better_than(&self.misfits(first, &at_first)).then_some(shift)
     }
 
-    /// The shift since the image before, pixels, up to `FARTHEST`. `None` where most of the image
-    /// does not show it.
-    pub(crate) fn step(&self) -> Option<[f32; 2]> {
-        let (shift, after) = self.iterated(self.nearest())?;
+    /// The shift since the image before, pixels, up to `FARTHEST` per axis. `None` where most of the
+    /// image does not show it.
+    pub(crate) fn turn(&self) -> Option<[f32; 2]> {
+        let start = self.best_whole_shift();
+        let (shift, after) = self.iterated(start, self.equations_at(start))?;
         // Compared with the opposite shift: between pixels noise alone fits better than on them,
         // and this one lies between them alike.
         let opposite = shift.map(|by| -by);
@@ -229,11 +241,14 @@ impl<'a> PicturePair<'a> {
         after.are_better_in_most(&before).then_some(shift)
     }
 
-    /// The shift to which the registration leads from a start (Lucas and Kanade 1981), with the
-    /// misfits there; `None` where the pictures do not determine it.
-    fn iterated(&self, start: [f32; 2]) -> Option<([f32; 2], Misfits)> {
+    /// The shift to which the registration leads from a start and the equations there (Lucas and
+    /// Kanade 1981), with the misfits; `None` where the pictures do not determine it.
+    fn iterated(
+        &self,
+        start: [f32; 2],
+        mut equations: RegistrationEquations,
+    ) -> Option<([f32; 2], Misfits)> {
         let mut shift = start;
-        let mut equations = self.equations_at(shift);
         for _ in 0..STEPS {
             let [x, y] = equations.step()?;
             shift = [shift[0] + x, shift[1] + y];
@@ -260,10 +275,17 @@ const AROUND: usize = 2;
 /// alone are enough.
 const ELSEWHERE: f32 = 0.1;
 
-/// By how many standard deviations more tiles must fit better than worse, where a shift was
-/// searched for: of some hundred shifts the best lies three above what chance makes of one. With
-/// half of it a clear sky turns by chance (reasoned, not measured).
+/// Share of the tiles that must fit better, where a shift was searched for. Where many targets cross
+/// a clear sky it is up to 0.71, as half of the empty tiles fit better by chance; over waves in a
+/// half of the image it is 0.7 to 1. With half of it chance is a turn.
+const MOST_TILES: f32 = 0.72;
+/// By how many standard deviations more tiles must fit better than worse: of some hundred shifts
+/// the best lies three above what chance makes of one. With half of it a clear sky turns by chance
+/// where few tiles stay in view.
 const MOST_TILES_SDS: f32 = 4.0;
+/// Fewest tiles in view that may show a shift: a third of all. With half of it as many must agree
+/// as one large target covers.
+const LEAST_TILES: f32 = 36.0;
 
 /// How badly two pictures fit in one tile, or in several together.
 #[derive(Clone, Copy, Debug, Default)]
@@ -308,12 +330,21 @@ impl Misfits {
 
     /// Whether these misfits are less than `before` in so many more tiles than they are larger in
     /// that chance does not make it: a scene fills most of the image, and targets do not, however
-    /// many.
+    /// many. Tiles that one of the two shifts moves out of view say nothing.
     fn are_better_in_most(&self, before: &Self) -> bool {
-        let gains = tiles().map(|[x, y]| self.0[y][x].gain(before.0[y][x]));
-        let signs: f32 = gains.map(|gain| if gain > 0.0 { 1.0 } else { -1.0 }).sum();
-        // By chance the sum of n signs has the variance n.
-        signs > MOST_TILES_SDS * ((TILES[0] * TILES[1]) as f32).sqrt()
+        let (mut better, mut worse) = (0.0_f32, 0.0_f32);
+        for [x, y] in tiles() {
+            let (now, before) = (self.0[y][x], before.0[y][x]);
+            if now.weights > 0.0 && before.weights > 0.0 {
+                better += f32::from(now.mean() < before.mean());
+                worse += f32::from(now.mean() > before.mean());
+            }
+        }
+        // By chance the difference of n votes has the variance n.
+        let votes = better + worse;
+        votes >= LEAST_TILES
+            && better > MOST_TILES * votes
+            && better - worse > MOST_TILES_SDS * votes.sqrt()
     }
 
     /// The misfit of all tiles together that are not near `others`.
@@ -352,4 +383,89 @@ fn tiles_apart_from(others: &[[usize; 2]]) -> impl Iterator<Item = [usize; 2]> {
 
 fn is_about([x, y]: [usize; 2], [column, row]: [usize; 2]) -> bool {
     x.abs_diff(column) <= AROUND && y.abs_diff(row) <= AROUND
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f32::consts::TAU;
+
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, Normal};
+
+    use super::*;
+
+    /// Waves of three to eight pixels, seen by a camera that has turned by so many pixels.
+    fn waves([width, height]: [usize; 2], [right, down]: [f32; 2]) -> Plane {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let waves: [[f32; 3]; 16] = std::array::from_fn(|_| {
+            let [number, way]: [f32; 2] = [rng.random_range(0.8..2.0), rng.random_range(0.0..TAU)];
+            [number * way.cos(), number * way.sin(), rng.random_range(0.0..TAU)]
+        });
+        Plane::from_fn(width, height, |x, y| {
+            let wave = |[along, up, phase]: &[f32; 3]| {
+                (along * (x as f32 + right) + up * (y as f32 + down) + phase).sin()
+            };
+            120.0 + waves.iter().map(wave).sum::<f32>()
+        })
+    }
+
+    /// Adds a sensor's noise.
+    fn noisy(mut plane: Plane, sd: f32, seed: u64) -> Plane {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let noise = Normal::new(0.0, sd).unwrap();
+        plane.samples_mut().iter_mut().for_each(|sample| *sample += noise.sample(&mut rng));
+        plane
+    }
+
+    fn turn(now: &Plane, then: &Plane) -> Option<[f32; 2]> {
+        PicturePair::successive(now, then, &mut Vec::new()).unwrap().turn()
+    }
+
+    #[test]
+    fn a_turn_is_found_wherever_it_goes() {
+        let ways = [[6.0, 0.0], [-6.4, 0.3], [0.2, 5.0], [0.0, -5.5], [4.3, -4.2], [8.0, 0.0]];
+        for sides in [[80, 60], [40, 30]] {
+            for way in ways {
+                let (then, now) = (waves(sides, [0.0; 2]), waves(sides, way));
+                let found = turn(&noisy(now, 0.3, 2), &noisy(then, 0.3, 3));
+                let off = found.map(|found| (found[0] - way[0]).hypot(found[1] - way[1]));
+                assert!(off.is_some_and(|off| off < 0.2), "{sides:?}, {way:?}: {found:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn neither_light_nor_a_sky_that_is_too_bright_hides_a_turn() {
+        let sides = [80, 60];
+        let changed = |way, brighter: f32, sky: usize| {
+            let mut plane = noisy(waves(sides, way), 0.3, 4);
+            plane.samples_mut().iter_mut().for_each(|sample| *sample += brighter);
+            (0..sky).for_each(|y| plane.row_mut(y).fill(255.0));
+            plane
+        };
+        for (brighter, sky) in [(10.0, 0), (-40.0, 0), (0.0, 24)] {
+            let (now, then) = (changed([5.0, 1.0], brighter, sky), changed([0.0; 2], 0.0, sky));
+            let found = turn(&now, &then).unwrap();
+            let off = (found[0] - 5.0).hypot(found[1] - 1.0);
+            assert!(off < 0.3, "{brighter} levels, {sky} rows: {found:?}");
+        }
+    }
+
+    #[test]
+    fn neither_noise_nor_targets_however_many_are_a_turn() {
+        let spots = |by: f32, seed| {
+            let plane = Plane::from_fn(80, 60, |x, y| {
+                let is_spot = (x as f32 - by).rem_euclid(20.0) < 2.0 && y % 15 < 2;
+                if is_spot { 160.0 } else { 120.0 }
+            });
+            noisy(plane, 0.5, seed)
+        };
+        for seed in 0..100 {
+            let sky = |seed| noisy(Plane::from_fn(80, 60, |_, _| 120.0), 2.0, seed);
+            assert_eq!(turn(&sky(seed), &sky(seed + 1000)), None, "noise, seed {seed}");
+            let by = (seed % 6) as f32;
+            assert_eq!(turn(&spots(by, seed), &spots(0.0, seed + 1000)), None, "by {by}, {seed}");
+        }
+    }
 }

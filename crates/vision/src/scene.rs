@@ -5,9 +5,9 @@
 //! same as in such a picture it shows the scene and no target, however well a reference correlates.
 
 use crossfix_correlation::Plane;
-use pulp::{Arch, Simd, WithSimd};
 
 use crate::ImagePoint;
+use crate::coarse_picture::{COARSENESS, coarsened, smooth};
 use crate::crop::replace_invalid;
 use crate::jerk::RowGlance;
 use crate::registration::{LEAST_COMMON, PicturePair, STRIDE, overlap};
@@ -22,13 +22,6 @@ const SPACING_S: f64 = 0.6;
 /// Preferred age of the picture from which a change is computed, s: a target has moved by its own
 /// size by then. With half of it a target that has moved by half its size cancels by half.
 const CHANGED_S: f64 = 1.0;
-/// Side of the blocks that make one pixel of the coarse picture, px; the camera's turn is found in
-/// that. In single pixels the noise has more slope than clouds have, and no turn is noticed; with
-/// half of it the noise of a block is twice as large, and faint clouds show no turn.
-pub(crate) const COARSENESS: usize = 8;
-/// How often the coarse picture is smoothed, each time with weights of a quarter, a half and a
-/// quarter for neighbours. With half of it noise keeps more of its slope, against the scene's.
-const SMOOTHED: usize = 3;
 /// A camera stands still that has turned by less than this since it was last registered, px: twice
 /// what noise makes of it ...
 const STILL_PX: f64 = 0.1;
@@ -37,9 +30,10 @@ const STILL_PX: f64 = 0.1;
 /// registered.
 const STILL_S: f64 = 0.1;
 
-/// Least turn from one image to the next that is believed where no picture shows it, px: waves and
-/// clouds move by less. With half of it a sea is registered along the way of its waves.
-const LEAST_STEP_PX: f64 = 2.0;
+/// Least turn that is believed from one image to the next, px, and px/s since the image that was
+/// registered before: waves and clouds move by less. With half of either a sea is registered along
+/// the way of its waves.
+const LEAST_TURN: [f64; 2] = [2.0, 20.0];
 
 /// A picture of the scene.
 #[derive(Clone, Debug, Default)]
@@ -84,10 +78,12 @@ impl ScenePicture {
 pub(crate) struct SceneMemory {
     /// The newest first.
     pictures: Vec<ScenePicture>,
+    /// The coarse picture of the image that was registered last, ...
     coarse: Plane,
-    /// What `coarse` was before it was smoothed, and that of the image registered before.
+    /// ... what it was before it was smoothed, and the same of the image registered before that;
+    /// empty if there was none.
     sharp: Plane,
-    last: Plane,
+    sharp_before: Plane,
     between: Plane,
     sums: Vec<f32>,
     /// Number of pictures kept since the beginning.
@@ -130,12 +126,14 @@ impl SceneMemory {
         self.turned = self.turned();
         self.pictures.clear();
         (self.glance, self.is_still) = (RowGlance::default(), false);
+        // The next image is registered with none before it.
         self.sharp = Plane::default();
     }
 
     /// Finds how the camera has turned by registering the image with the newest picture; against
-    /// that one the other pictures are shifted as when it was taken. A camera that stood still
-    /// lately is registered only now and then.
+    /// that one the other pictures are shifted as when it was taken. Where the camera may have
+    /// turned far, or the picture shows nothing, the image registered before says where to begin.
+    /// A camera that stood still lately is registered only now and then.
     pub(crate) fn register(&mut self, image: &Plane, interval: f64) {
         self.unregistered_s += interval;
         for picture in &mut self.pictures {
@@ -151,19 +149,21 @@ impl SceneMemory {
         if !is_time && !is_kept {
             return;
         }
-        self.unregistered_s = 0.0;
+        let since_s = std::mem::take(&mut self.unregistered_s);
         coarsened(image, &mut self.coarse, &mut self.sums);
         replace_invalid(&mut self.coarse);
-        std::mem::swap(&mut self.last, &mut self.sharp);
+        std::mem::swap(&mut self.sharp_before, &mut self.sharp);
         self.sharp.copy_from(&self.coarse);
         smooth(&mut self.coarse, &mut self.between);
-        let step = (is_jerked || !self.is_still).then(|| self.step()).flatten();
+        let Some(before) = self.pictures.first().map(|newest| newest.shift) else { return };
+        let shift = if self.is_unregistered {
+            before
+        } else {
+            let may_have_turned = is_jerked || !self.is_still;
+            self.shift_from(before, may_have_turned, since_s)
+        };
         let Some((newest, others)) = self.pictures.split_first_mut() else { return };
-        let before = newest.shift;
-        if !self.is_unregistered {
-            let guess = step.map_or(before, |step| [0, 1].map(|i| before[i] + step[i]));
-            newest.shift = turned(&self.coarse, &newest.coarse, guess).unwrap_or(guess);
-        }
+        newest.shift = shift;
         self.is_still =
             newest.shift.iter().zip(before).all(|(now, before)| (now - before).abs() < STILL_PX);
         for picture in others {
@@ -176,13 +176,29 @@ impl SceneMemory {
         }
     }
 
-    /// By how much the camera has turned since the image that was registered last, px: the kept
-    /// pictures show a large turn only near a first guess, and that of a scene which is fine or
-    /// changes quickly not at all.
-    fn step(&mut self) -> Option<[f64; 2]> {
-        let pair = PicturePair::successive(&self.sharp, &self.last, &mut self.sums)?;
-        let step = pair.step()?.map(|step| f64::from(step) * COARSENESS as f64);
-        (step[0].hypot(step[1]) > LEAST_STEP_PX).then_some(step)
+    /// Shift of the image against the newest picture, px, which was `before` in the image
+    /// registered `since_s` seconds before. What neither of the two shows has not turned.
+    fn shift_from(&mut self, before: [f64; 2], may_have_turned: bool, since_s: f64) -> [f64; 2] {
+        let seen = self.seen_near(before);
+        // The picture shows a large turn only near a first guess, and that of a scene which is fine
+        // or changes quickly not at all.
+        let turn = (may_have_turned || seen.is_none()).then(|| self.turn_since(since_s)).flatten();
+        let Some(turn) = turn else { return seen.unwrap_or(before) };
+        let guess = [0, 1].map(|i| before[i] + turn[i]);
+        self.seen_near(guess).unwrap_or(guess)
+    }
+
+    /// The shift against the newest picture, px, if it determines one near a first guess.
+    fn seen_near(&self, guess: [f64; 2]) -> Option<[f64; 2]> {
+        shift_between(&self.coarse, &self.pictures.first()?.coarse, guess)
+    }
+
+    /// By how much the camera has turned since the image registered `since_s` seconds before, px.
+    fn turn_since(&mut self, since_s: f64) -> Option<[f64; 2]> {
+        let pair = PicturePair::successive(&self.sharp, &self.sharp_before, &mut self.sums)?;
+        let turn = pair.turn()?.map(|turn| f64::from(turn) * COARSENESS as f64);
+        let [least_px, least_px_s] = LEAST_TURN;
+        (turn[0].hypot(turn[1]) > least_px.max(least_px_s * since_s)).then_some(turn)
     }
 
     /// Keeps a picture if it is time to, and returns its number.
@@ -195,8 +211,8 @@ impl SceneMemory {
         // Each picture is registered itself, so that errors do not add up from picture to picture.
         if !self.is_unregistered {
             for picture in &mut self.pictures {
-                picture.shift =
-                    turned(&self.coarse, &picture.coarse, picture.shift).unwrap_or(picture.shift);
+                picture.shift = shift_between(&self.coarse, &picture.coarse, picture.shift)
+                    .unwrap_or(picture.shift);
             }
         }
         self.turned = self.turned();
@@ -251,79 +267,13 @@ impl SceneMemory {
     }
 }
 
-/// By how much the camera has turned between two coarse pictures, px of the image, if they
-/// determine it; `before` is what was known.
-fn turned(now: &Plane, then: &Plane, before: [f64; 2]) -> Option<[f64; 2]> {
+/// Shift of a coarse picture against an older one, px of the image, if they determine one near a
+/// first guess.
+fn shift_between(now: &Plane, then: &Plane, guess: [f64; 2]) -> Option<[f64; 2]> {
     let coarseness = COARSENESS as f64;
-    // From the last shift on: registration finds only shifts near its first guess.
-    let before = before.map(|turned| (turned / coarseness) as f32);
-    let found = PicturePair::new(now, then)?.shift_near(before)?;
-    Some(found.map(|turned| f64::from(turned) * coarseness))
-}
-
-/// The means of blocks. `sums` is memory for a row of them.
-fn coarsened(from: &Plane, to: &mut Plane, sums: &mut Vec<f32>) {
-    to.reshape(from.width() / COARSENESS, from.height() / COARSENESS);
-    let share = 1.0 / (COARSENESS * COARSENESS) as f32;
-    for y in 0..to.height() {
-        // Down the columns first: that is many at a time. A picture lower than a block counts its
-        // last row several times.
-        let rows: [&[f32]; COARSENESS] =
-            std::array::from_fn(|k| from.row((y * COARSENESS + k).min(from.height() - 1)));
-        sums.clear();
-        sums.resize(from.width(), 0.0);
-        Arch::new().dispatch(ColumnSums { rows, sums });
-        let (blocks, _) = sums.as_chunks::<COARSENESS>();
-        for (mean, [a, b, c, d, e, f, g, h]) in to.row_mut(y).iter_mut().zip(blocks) {
-            *mean = share * (((a + e) + (b + f)) + ((c + g) + (d + h)));
-        }
-    }
-}
-
-/// The sums of rows, column by column.
-struct ColumnSums<'a> {
-    rows: [&'a [f32]; COARSENESS],
-    sums: &'a mut [f32],
-}
-
-impl WithSimd for ColumnSums<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) {
-        let [a, b, c, d, e, f, g, h] = self.rows.map(|row| &row[..self.sums.len()]);
-        for (x, sum) in self.sums.iter_mut().enumerate() {
-            *sum = ((a[x] + b[x]) + (c[x] + d[x])) + ((e[x] + f[x]) + (g[x] + h[x]));
-        }
-    }
-}
-
-/// Smooths a picture along rows and columns.
-fn smooth(plane: &mut Plane, between: &mut Plane) {
-    let (width, height) = (plane.width(), plane.height());
-    if width < 2 {
-        return;
-    }
-    between.reshape(width, height);
-    let mean = |before: f32, at: f32, after: f32| 0.25 * before + 0.5 * at + 0.25 * after;
-    for _ in 0..SMOOTHED {
-        for y in 0..height {
-            let (row, out) = (plane.row(y), between.row_mut(y));
-            for (out, three) in out[1..].iter_mut().zip(row.windows(3)) {
-                *out = mean(three[0], three[1], three[2]);
-            }
-            // Beyond the border the border pixel is repeated.
-            out[0] = mean(row[0], row[0], row[1]);
-            out[width - 1] = mean(row[width - 2], row[width - 1], row[width - 1]);
-        }
-        for y in 0..height {
-            let (up, down) = (y.saturating_sub(1), (y + 1).min(height - 1));
-            let rows = between.row(up).iter().zip(between.row(y)).zip(between.row(down));
-            for (out, ((up, at), down)) in plane.row_mut(y).iter_mut().zip(rows) {
-                *out = mean(*up, *at, *down);
-            }
-        }
-    }
+    let guess = guess.map(|shift| (shift / coarseness) as f32);
+    let found = PicturePair::new(now, then)?.shift_near(guess)?;
+    Some(found.map(|shift| f64::from(shift) * coarseness))
 }
 
 #[cfg(test)]

@@ -96,7 +96,8 @@ fn is_near(at: usize, [from, to]: [usize; 2]) -> bool {
 /// One scale.
 ///
 /// The background's cells are fixed to the scene: when the camera turns they move over the image by
-/// whole cells, and for the rest the image is sampled between its own cells.
+/// whole cells, and for the rest the image is sampled between its own cells. A second mean keeps the
+/// image's cells: what is on the lens, or written over the picture.
 #[derive(Debug)]
 pub(super) struct Level {
     /// Side of a cell, px.
@@ -198,9 +199,12 @@ impl Level {
     }
 
     /// Whether what stands out at a cell is on the lens, or written over the picture: what has kept
-    /// its place in the image explains it, and the background does not. While the camera has not
-    /// turned the two say the same, and this is false.
+    /// its place in the image explains it, and the background does not. False while the camera has
+    /// not turned: the two are the same then, but for the light and the limit on outliers.
     pub(super) fn is_on_lens(&self, [x, y]: [usize; 2]) -> bool {
+        if (self.whole, self.rest) == ([0; 2], [0.0; 2]) {
+            return false;
+        }
         let now = self.now.row(y)[x];
         // The background's cell (x, y) lies at (x, y) - rest in the image's cells.
         let at = [x as f32 - self.rest[0], y as f32 - self.rest[1]].map(f64::from);
@@ -249,7 +253,9 @@ impl Level {
         self.remember_changes();
     }
 
-    /// Takes the image into the mean of what keeps its place in it, except where `known` covers it.
+    /// Takes the image into the mean of what keeps its place in it, except where `known` covers it:
+    /// in the background's cells, which lie within a cell of the image's. Known targets are painted
+    /// over, so that their edges are as empty as they.
     fn learn_lens(&mut self, Moment { share, is_first, .. }: Moment, known: &[Cells]) {
         if is_first {
             self.on_lens.copy_from(&self.stands_out);

@@ -117,7 +117,7 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
         top = greatest_about(&level.now, top, standing);
     }
     // If the top has the sign opposite to the change or is much lower than it, something has gone
-    // and nothing has come.
+    // and nothing has come; what is on the lens has been there before.
     let strength = standing(level.now.row(top[1])[top[0]]) / level.spread;
     let share = level.new_share(top);
     if strength < level.least_strength().max(LEAST_OF_CHANGE * change.abs())
