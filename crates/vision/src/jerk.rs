@@ -20,8 +20,9 @@ struct Jerk {
 /// The numbers in use; what half of each does is said at its field.
 const JERK: Jerk = Jerk { factor: 1.5, levels: 0.25, usual_s: 0.65 };
 
-/// Of this many blocks of the coarse picture along a row one is compared: there are hundreds, and a jerk has to change
-/// half of them. With half of it the glance costs twice as much and shows the same.
+/// Of this many blocks of the coarse picture along a row one is compared: there are hundreds, and a
+/// jerk has to change half of them. With half of it the glance costs twice as much and shows the
+/// same.
 const GLANCED: usize = 4;
 
 /// One row of some blocks, by which a jerk of the camera is noticed at a tenth of the cost of a

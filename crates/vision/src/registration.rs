@@ -22,8 +22,9 @@ const LONGEST_STEP: f32 = 2.0;
 /// turn. With half of it the edges that show a large turn count for less, and it is not reached.
 const OUTLYING: f32 = 5.0;
 /// The same for two images that follow each other, in units of the median difference without a
-/// shift, and at most `OUTLYING`: what is written over the picture stays in its place, and its edges
-/// must not outweigh a faint scene. With half of it most of a scene that turns counts for less.
+/// shift, and at most `OUTLYING`: what is written over the picture stays in its place, and its
+/// edges must not outweigh a faint scene. With half of it most of a scene that turns counts for
+/// less.
 const OUTLYING_MEDIANS: f32 = 2.0;
 /// It is at least this, levels: where more than half of the image is without noise, as a sky that
 /// is too bright, the median is 0. With half of it the noise of blocks counts as outlying.
@@ -229,8 +230,8 @@ impl<'a> PicturePair<'a> {
         after.are_better_than(&self.misfits(first, &at_first)).then_some(shift)
     }
 
-    /// The shift since the image before, pixels, up to `FARTHEST` per axis. `None` where most of the
-    /// image does not show it.
+    /// The shift since the image before, pixels, up to `FARTHEST` per axis. `None` where most of
+    /// the image does not show it.
     pub(crate) fn turn(&self) -> Option<[f32; 2]> {
         let start = self.best_whole_shift();
         let (shift, after) = self.iterated(start, self.equations_at(start))?;
@@ -275,9 +276,9 @@ const AROUND: usize = 2;
 /// alone are enough.
 const ELSEWHERE: f32 = 0.1;
 
-/// Share of the tiles that must fit better, where a shift was searched for. Where many targets cross
-/// a clear sky it is up to 0.71, as half of the empty tiles fit better by chance; over waves in a
-/// half of the image it is 0.7 to 1. With half of it chance is a turn.
+/// Share of the tiles that must fit better, where a shift was searched for. Where many targets
+/// cross a clear sky it is up to 0.71, as half of the empty tiles fit better by chance; over waves
+/// in a half of the image it is 0.7 to 1. With half of it chance is a turn.
 const MOST_TILES: f32 = 0.72;
 /// By how many standard deviations more tiles must fit better than worse: of some hundred shifts
 /// the best lies three above what chance makes of one. With half of it a clear sky turns by chance

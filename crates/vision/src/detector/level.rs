@@ -96,8 +96,8 @@ fn is_near(at: usize, [from, to]: [usize; 2]) -> bool {
 /// One scale.
 ///
 /// The background's cells are fixed to the scene: when the camera turns they move over the image by
-/// whole cells, and for the rest the image is sampled between its own cells. A second mean keeps the
-/// image's cells: what is on the lens, or written over the picture.
+/// whole cells, and for the rest the image is sampled between its own cells. A second mean keeps
+/// the image's cells: what is on the lens, or written over the picture.
 #[derive(Debug)]
 pub(super) struct Level {
     /// Side of a cell, px.
