@@ -26,6 +26,9 @@ const ANCHOR: &str = "48.3538,11.7861,490";
 const NOT_THERE: i32 = 77;
 /// What one snapshot is after the other, s.
 const PERIOD_S: f64 = 0.5;
+/// What a live site's agents play, s, twice as fast as life: longer than a reader needs to start on
+/// a loaded machine. Tests end them.
+const PLAYED_S: f64 = 120.0;
 
 fn repository(path: &str) -> String {
     format!("{}/../{path}", env!("CARGO_MANIFEST_DIR"))
@@ -290,7 +293,7 @@ struct Told {
 
 impl Told {
     fn start(format: &str, options: &[&str]) -> Self {
-        let site = Site::new(8.0);
+        let site = Site::new(PLAYED_S);
         let anchor =
             "[anchor]\nlatitude_deg = 48.3538\nlongitude_deg = 11.7861\nheight_m = 490.0\n";
         site.write("network.toml", &format!("{}{anchor}", site.text("network.toml")));
@@ -431,7 +434,7 @@ fn what_takes_no_more_ends_the_command_and_a_receiver_that_refuses_does_not() {
 fn foxglove_connects_to_a_live_site() {
     let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let address = format!("127.0.0.1:{port}");
-    let site = Site::new(8.0);
+    let site = Site::new(PLAYED_S);
     let network = site.path("network.toml");
     let fusion = site.start_fusion();
     let server = site.start(&["outlet", "foxglove", "-c", &network, "--listen", &address]);
