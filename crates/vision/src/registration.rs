@@ -63,6 +63,11 @@ struct RegistrationEquations {
 }
 
 impl RegistrationEquations {
+    /// Mean difference of brightness, levels.
+    fn brighter(&self) -> f32 {
+        self.off / self.weight.max(1.0)
+    }
+
     fn add(&mut self, weight: f32, [gx, gy]: [f32; 2], off: f32) {
         self.weight += weight;
         self.slope[0] += weight * gx;
@@ -167,9 +172,8 @@ impl<'a> PicturePair<'a> {
         equations
     }
 
-    /// The misfits at a shift, pixels, about the mean difference of brightness there.
-    fn misfits(&self, shift: [f32; 2], equations: &RegistrationEquations) -> Misfits {
-        let brighter = equations.off / equations.weight.max(1.0);
+    /// The misfits at a shift, pixels, about a difference of brightness, levels.
+    fn misfits(&self, shift: [f32; 2], brighter: f32) -> Misfits {
         let sides = [self.now.width(), self.now.height()];
         let mut tiles = [[TileMisfit::default(); TILES[0]]; TILES[1]];
         self.each_off(shift, |[x, y], _, off| {
@@ -226,29 +230,30 @@ impl<'a> PicturePair<'a> {
     /// more than noise would, or than a target that moves: a clear sky shows no turn.
     pub(crate) fn shift_near(&self, first: [f32; 2]) -> Option<[f32; 2]> {
         let at_first = self.equations_at(first);
-        let (shift, after) = self.iterated(first, at_first)?;
-        after.are_better_than(&self.misfits(first, &at_first)).then_some(shift)
+        let (shift, at_last) = self.iterated(first, at_first)?;
+        let after = self.misfits(shift, at_last.brighter());
+        after.are_better_than(&self.misfits(first, at_first.brighter())).then_some(shift)
     }
 
     /// The shift since the image before, pixels, up to `FARTHEST` per axis. `None` where most of
     /// the image does not show it.
     pub(crate) fn turn(&self) -> Option<[f32; 2]> {
         let start = self.best_whole_shift();
-        let (shift, after) = self.iterated(start, self.equations_at(start))?;
+        let (shift, _) = self.iterated(start, self.equations_at(start))?;
         // Compared with the opposite shift: between pixels noise alone fits better than on them,
         // and this one lies between them alike.
-        let opposite = shift.map(|by| -by);
-        let before = self.misfits(opposite, &self.equations_at(opposite));
+        let [after, before] =
+            [1.0, -1.0].map(|sign| self.misfits(shift.map(|by| sign * by), self.brighter));
         after.are_better_in_most(&before).then_some(shift)
     }
 
     /// The shift to which the registration leads from a start and the equations there (Lucas and
-    /// Kanade 1981), with the misfits; `None` where the pictures do not determine it.
+    /// Kanade 1981), with the equations there; `None` where the pictures do not determine it.
     fn iterated(
         &self,
         start: [f32; 2],
         mut equations: RegistrationEquations,
-    ) -> Option<([f32; 2], Misfits)> {
+    ) -> Option<([f32; 2], RegistrationEquations)> {
         let mut shift = start;
         for _ in 0..STEPS {
             let [x, y] = equations.step()?;
@@ -258,7 +263,7 @@ impl<'a> PicturePair<'a> {
                 break;
             }
         }
-        Some((shift, self.misfits(shift, &equations)))
+        Some((shift, equations))
     }
 }
 
@@ -438,6 +443,7 @@ mod tests {
 
     #[test]
     fn neither_light_nor_a_sky_that_is_too_bright_hides_a_turn() {
+        // Where more than half of the rows are sky the median difference is 0.
         let sides = [80, 60];
         let changed = |way, brighter: f32, sky: usize| {
             let mut plane = noisy(waves(sides, way), 0.3, 4);
@@ -445,7 +451,7 @@ mod tests {
             (0..sky).for_each(|y| plane.row_mut(y).fill(255.0));
             plane
         };
-        for (brighter, sky) in [(10.0, 0), (-40.0, 0), (0.0, 24)] {
+        for (brighter, sky) in [(10.0, 0), (-40.0, 0), (0.0, 31), (-10.0, 24)] {
             let (now, then) = (changed([5.0, 1.0], brighter, sky), changed([0.0; 2], 0.0, sky));
             let found = turn(&now, &then).unwrap();
             let off = (found[0] - 5.0).hypot(found[1] - 1.0);

@@ -30,10 +30,13 @@ const STILL_PX: f64 = 0.1;
 /// registered.
 const STILL_S: f64 = 0.1;
 
-/// Least turn that is believed from one image to the next, px, and px/s since the image that was
-/// registered before: waves and clouds move by less. With half of either a sea is registered along
-/// the way of its waves.
-const LEAST_TURN: [f64; 2] = [2.0, 20.0];
+/// Least turn from one image to the next that is believed, px: with half of it a sea is registered
+/// along the way of its waves, ...
+const LEAST_TURN_PX: f64 = 2.0;
+/// ... and least speed of a turn since the image that was registered before, px/s, as waves and
+/// clouds have moved by more in slow streams. With half of it they turn a camera of 5 images a
+/// second (reasoned, not measured).
+const LEAST_TURN_PX_S: f64 = 20.0;
 
 /// A picture of the scene.
 #[derive(Clone, Debug, Default)]
@@ -197,8 +200,7 @@ impl SceneMemory {
     fn turn_since(&mut self, since_s: f64) -> Option<[f64; 2]> {
         let pair = PicturePair::successive(&self.sharp, &self.sharp_before, &mut self.sums)?;
         let turn = pair.turn()?.map(|turn| f64::from(turn) * COARSENESS as f64);
-        let [least_px, least_px_s] = LEAST_TURN;
-        (turn[0].hypot(turn[1]) > least_px.max(least_px_s * since_s)).then_some(turn)
+        (turn[0].hypot(turn[1]) > LEAST_TURN_PX.max(LEAST_TURN_PX_S * since_s)).then_some(turn)
     }
 
     /// Keeps a picture if it is time to, and returns its number.
