@@ -269,6 +269,32 @@ fn a_camera_that_turns_away_finds_nothing_in_the_turn_and_the_target_after_it() 
     assert!(seen >= 28, "in {seen} of 30 images");
 }
 
+/// A camera in the hand is raised: what comes into view is no target, though what is near moves
+/// farther in the image than what is far.
+#[test]
+fn what_comes_into_view_as_the_camera_is_raised_is_not_found() {
+    fn raised(x: f64, y: f64, time_s: f64) -> f64 {
+        let along = 250.0 * (time_s - 1.0).clamp(0.0, 0.6);
+        let (far, near) = (y - along, y - 1.2 * along);
+        let clouds = 25.0 * (x / 23.0).sin() * (far / 31.0).cos() + 10.0 * ((x + far) / 9.0).sin();
+        // Posts of different heights.
+        let (post, off) = ((x / 40.0).floor(), x.rem_euclid(40.0));
+        let top = 50.0 * (2.7 * post).sin() - 60.0;
+        if off < 6.0 && (top..top + 9.0).contains(&near) { 40.0 } else { 150.0 + clouds }
+    }
+    for seed in 24..28 {
+        let mut world = World::new(320, 240, 2.0, raised, seed);
+        watch(
+            &mut world,
+            2.5,
+            |_| Vec::new(),
+            |time_s, tracks| {
+                assert!(tracks.is_empty(), "seed {seed} at {time_s}: {tracks:?}");
+            },
+        );
+    }
+}
+
 /// A reticle of lines, written over the picture.
 fn with_reticle(mut image: Plane) -> Plane {
     for y in (40..80).chain(160..200) {

@@ -93,11 +93,13 @@ impl CommonMotion {
     }
 }
 
-/// The mean velocity, weighted by what is known of each.
+/// The mean velocity, weighted by what each tells of the common one: no thing tells it better than
+/// to [`ALIKE_SHARE`], however well its own velocity is known.
 fn mean<'a>(things: impl Iterator<Item = &'a MovingThing>) -> Option<MovingThing> {
     let (mut velocity, mut information, mut any) = ([0.0; 2], 0.0, None);
     for thing in things {
-        let weight = thing.sd.powi(2).max(f64::MIN_POSITIVE).recip();
+        let of_scene = thing.sd.hypot(ALIKE_SHARE * thing.speed());
+        let weight = of_scene.powi(2).max(f64::MIN_POSITIVE).recip();
         velocity = [0, 1].map(|i| velocity[i] + weight * thing.velocity[i]);
         information += weight;
         any = Some(*thing);
@@ -199,6 +201,22 @@ mod tests {
         let many: Vec<MovingThing> =
             (0..9).map(f64::from).map(|i| thing([300.0, 9.0], [60.0 * i, 300.0], 5.0)).collect();
         assert!(common(&[&scene(8, [60.0, 0.0]), &many]).is_none(), "too few of all");
+    }
+
+    #[test]
+    fn a_target_whose_velocity_is_known_well_is_not_taken_for_the_scene() {
+        let unsure = |number: u32| {
+            let across = 600.0 / f64::from(number);
+            let thing = move |i| thing([across * i, 9.0], [-150.0, 2.0 * (i % 5.0)], 20.0);
+            (0..number).map(f64::from).map(thing)
+        };
+        let target = thing([300.0, 200.0], [-100.0, 0.0], 0.4);
+        for number in [10, 20, 200] {
+            let scene =
+                CommonMotion::of(unsure(number).chain(std::iter::once(target)), SIDES).unwrap();
+            assert!(scene.holds(&thing([0.0, 0.0], [-150.0, 0.0], 1.0)), "{number}: {scene:?}");
+            assert!(!scene.holds(&target), "{number}: {scene:?}");
+        }
     }
 
     #[test]
