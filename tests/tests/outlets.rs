@@ -26,8 +26,8 @@ const ANCHOR: &str = "48.3538,11.7861,490";
 const NOT_THERE: i32 = 77;
 /// What one snapshot is after the other, s.
 const PERIOD_S: f64 = 0.5;
-/// What a live site's agents play, s, twice as fast as life: longer than a reader needs to start on
-/// a loaded machine. Tests end them.
+/// Length of the scene that a live site's agents play at twice its speed, s: a minute, as long as
+/// tests wait. With half of it a reader that starts slowly on a loaded machine may find them gone.
 const PLAYED_S: f64 = 120.0;
 
 fn repository(path: &str) -> String {
@@ -363,7 +363,7 @@ fn live_tracks_go_out_over_a_connection_that_is_made_again() {
 
 #[test]
 fn tracks_of_a_fusion_centre_that_has_died_are_said_no_more() {
-    let site = Site::new(20.0);
+    let site = Site::new(PLAYED_S);
     let anchor = "[anchor]\nlatitude_deg = 48.3538\nlongitude_deg = 11.7861\nheight_m = 490.0\n";
     site.write("network.toml", &format!("{}{anchor}", site.text("network.toml")));
     let (network, file) = (site.path("network.toml"), site.path("live.jsonl"));

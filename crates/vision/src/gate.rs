@@ -172,30 +172,34 @@ impl TargetBelief {
             config,
         );
         log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
-        // Where another target is, something else may stand out beside what is painted over.
+        mask_outside(&mut scratch.ratios, origin, image);
+        // Not where another target is in the gate: its blurred edge beside what is painted over is
+        // neither background nor this target. In dense swarms it cost 45 numbers of 244 crossings
+        // instead of 29.
         let is_alone = !frame.others.any_overlaps(&region.covered());
         if is_alone && config.has(TrackerPart::BackgroundEnergy) {
             self.weigh_background(scratch);
         }
-        mask_outside(&mut scratch.ratios, origin, image);
         let prior = self.prior(&self.motion, self.hidden, region, frame);
         scratch.map.of(&scratch.ratios, &prior)
     }
-}
 
-impl TargetBelief {
-    /// Takes the likelihood of the background's energy from the log likelihood ratios; what lies
-    /// beside the likeliest placement shows how much it has.
+    /// Takes from the log likelihood ratios the logarithm of the probability that background has the
+    /// energy there; what lies beside the likeliest placement shows how much it has.
     fn weigh_background(&self, scratch: &mut Scratch) {
-        let Scratch { gate, statistics, ratios, .. } = scratch;
+        let Scratch { statistics, ratios, .. } = scratch;
         let greatest = lanes::greatest(ratios.samples());
         let Some(best) = ratios.samples().iter().position(|ratio| *ratio == greatest) else {
             return;
         };
-        let placement = [best % ratios.width(), best / ratios.width()];
+        let best = [best % ratios.width(), best / ratios.width()];
         let reference = self.appearance.working.image();
         let sides = [reference.width(), reference.height()];
-        if let Some(background) = BackgroundEnergy::beside(gate, placement, sides, self.noise) {
+        let is_inside = |[x, y]: [usize; 2]| ratios.row(y)[x] > IMPOSSIBLE;
+        let variances = &statistics.variance;
+        if let Some(background) =
+            BackgroundEnergy::beside(best, sides, self.noise, variances, is_inside)
+        {
             background.weigh(statistics, ratios);
         }
     }

@@ -53,17 +53,6 @@ pub(crate) fn sum(values: &[f32]) -> f32 {
     rest.iter().sum::<f32>() + of_lanes.0.iter().sum::<f32>()
 }
 
-/// The sum of the squares of some numbers about a value.
-pub(crate) fn squares_about(value: f32, values: &[f32]) -> f32 {
-    let (chunks, rest) = values.as_chunks();
-    let of_lanes = chunks.iter().fold(Lanes::splat(0.0), |sum, chunk| {
-        let off = Lanes(*chunk) - Lanes::splat(value);
-        sum + off * off
-    });
-    let of_rest: f32 = rest.iter().map(|at| (at - value).powi(2)).sum();
-    of_rest + of_lanes.0.iter().sum::<f32>()
-}
-
 /// Eight numbers in one: an operation is done to each, by one instruction where there is one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Lanes(pub(crate) [f32; LANES]);
@@ -154,7 +143,7 @@ impl Mul<f32> for Lanes {
 mod tests {
     use proptest::prelude::*;
 
-    use super::{greatest, squares_about, sum};
+    use super::{greatest, sum};
 
     proptest! {
         #[test]
@@ -165,14 +154,12 @@ mod tests {
     }
 
     #[test]
-    fn the_greatest_and_the_sums_of_numbers_of_any_count() {
+    fn the_greatest_and_the_sum_of_numbers_of_any_count() {
         for count in 0..40 {
             let values: Vec<f32> = (0..count).map(|k| ((k * 7) % 11) as f32 - 20.0).collect();
             let largest = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
             assert_eq!(greatest(&values), largest);
             assert_eq!(sum(&values), values.iter().sum::<f32>());
-            let squares: f32 = values.iter().map(|value| (value + 15.0).powi(2)).sum();
-            assert_eq!(squares_about(-15.0, &values), squares);
         }
         assert_eq!(greatest(&[f32::NAN, -3.0, f32::NAN]), -3.0);
     }

@@ -63,7 +63,7 @@ struct RegistrationEquations {
 }
 
 impl RegistrationEquations {
-    /// Mean difference of brightness, levels.
+    /// Mean difference of brightness, levels; 0 where nothing is in common.
     fn brighter(&self) -> f32 {
         self.off / self.weight.max(1.0)
     }
@@ -241,7 +241,8 @@ impl<'a> PicturePair<'a> {
         let start = self.best_whole_shift();
         let (shift, _) = self.iterated(start, self.equations_at(start))?;
         // Compared with the opposite shift: between pixels noise alone fits better than on them,
-        // and this one lies between them alike.
+        // and this one lies between them alike. Both about one change of brightness: about one of
+        // its own, a sky that is too bright to show anything would fit better by rounding.
         let [after, before] =
             [1.0, -1.0].map(|sign| self.misfits(shift.map(|by| sign * by), self.brighter));
         after.are_better_in_most(&before).then_some(shift)

@@ -33,9 +33,9 @@ const STILL_S: f64 = 0.1;
 /// Least turn from one image to the next that is believed, px: with half of it a sea is registered
 /// along the way of its waves, ...
 const LEAST_TURN_PX: f64 = 2.0;
-/// ... and least speed of a turn since the image that was registered before, px/s, as waves and
-/// clouds have moved by more in slow streams. With half of it they turn a camera of 5 images a
-/// second (reasoned, not measured).
+/// ... and least speed of a turn since the image that was registered before, px/s: in slow streams
+/// waves and clouds move by more than [`LEAST_TURN_PX`] from one image to the next. With half of it
+/// theirs counts as the camera's turn at 5 images per second (reasoned, not measured).
 const LEAST_TURN_PX_S: f64 = 20.0;
 
 /// A picture of the scene.

@@ -81,8 +81,8 @@ fn bar([x, y]: [f32; 2], angle: f32) -> impl Fn(f32, f32) -> f32 {
     }
 }
 
-/// In how many of 80 images, ten a second, a target is followed that rolls by up to 40 degrees to
-/// either side from one to the next, alone in the sky.
+/// In how many of 80 images, ten a second, a target is followed that is alone in the sky, and whose
+/// roll is another in each image, up to 50 degrees to either side.
 fn followed_while_it_rolls(seed: u64, config: TrackerConfig) -> usize {
     let mut scene = Scene::new(seed, 1.0, 1.5, 0.0);
     let mut tracker = ImageTracker::new(config).unwrap();
@@ -90,12 +90,12 @@ fn followed_while_it_rolls(seed: u64, config: TrackerConfig) -> usize {
     let (mut angle, mut followed) = (0.0, 0);
     for image in 0..80_u8 {
         let phase = 0.06 * f32::from(image);
-        let at = [60.0 + 90.0 * (1.0 - phase.cos()), 60.0 + 40.0 * phase.sin()];
+        let at = [60.0 + 60.0 * (1.0 - phase.cos()), 60.0 + 40.0 * phase.sin()];
         let picture = scene.image_with(None, [0.0; 2], bar(at, angle));
         let time = Timestamp::from_seconds(f64::from(image) / 10.0);
         let track = tracker.step(&picture, time)[0];
         followed += usize::from(track.phase == TrackPhase::Tracking && off(&track, at) < 4.0);
-        angle = scene.rng.random_range(-0.7..0.7_f32);
+        angle = scene.rng.random_range(-0.9..0.9_f32);
     }
     followed
 }
@@ -108,7 +108,8 @@ fn a_target_that_rolls_alone_in_the_sky_is_held_at_ten_images_a_second() {
         (0..8).map(|seed| followed_while_it_rolls(seed, config.clone())).collect()
     };
     let (with, without) = (all(None), all(Some(TrackerPart::BackgroundEnergy)));
-    assert!(with.iter().all(|followed| *followed >= 72), "{with:?}");
     let sums = [&with, &without].map(|followed| followed.iter().sum::<usize>());
-    assert!(sums[0] > sums[1] + 8, "{with:?}, without the background's energy {without:?}");
+    // When it was written 582 of 640 were followed, and 556 without; none of the eight did worse.
+    assert!(with.iter().all(|followed| *followed >= 64), "{with:?}");
+    assert!(sums[0] > sums[1] + 10, "{with:?}, without the background's energy {without:?}");
 }

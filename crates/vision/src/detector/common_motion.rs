@@ -94,7 +94,8 @@ impl CommonMotion {
 }
 
 /// The mean velocity, weighted by what each tells of the common one: no thing tells it better than
-/// to [`ALIKE_SHARE`], however well its own velocity is known.
+/// to [`ALIKE_SHARE`] of its own speed, however well that is known, as what is near or seen by a
+/// camera that rolls moves otherwise.
 fn mean<'a>(things: impl Iterator<Item = &'a MovingThing>) -> Option<MovingThing> {
     let (mut velocity, mut information, mut any) = ([0.0; 2], 0.0, None);
     for thing in things {

@@ -106,6 +106,11 @@ const TURN_S: f64 = 0.2;
 /// hardly anything is found where a head follows a target (reasoned, not measured).
 const FAST_TURN_PX_S: f64 = 120.0;
 
+/// Most by which the registration of a scene that stands still jumps in one image, px: the noise of a
+/// bare scene moves it by a pixel or two, and 20 px/s that are registered every 0.1 s are two. With
+/// half of it such a jump counts as a fast turn at more than 30 images per second.
+const CORRECTION_PX: f64 = 4.0;
+
 /// A target that is followed already.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct KnownTarget {
@@ -153,7 +158,8 @@ pub(crate) struct Detector {
     sides: [usize; 2],
     levels: Vec<Level>,
     images: u32,
-    /// How long the background has been learnt without another scene in view, s.
+    /// How long the background has been learnt since another scene was in view or the scene turned
+    /// fast, s.
     settled_s: f64,
     /// Whether that has been long enough once since it was begun, ...
     has_warmed: bool,
@@ -227,8 +233,10 @@ impl Detector {
         if self.images > 1 {
             self.settled_s += interval;
         }
-        if moved_px > FAST_TURN_PX_S * interval {
+        if self.turns_fast(moved_px, interval) {
             self.settled_s = 0.0;
+            // Their next plots would come after a gap, and from elsewhere.
+            self.candidates.clear();
         }
         let scene = self.take_scene(interval);
         let is_warm = self.settled_s >= WARM_UP_S && self.images > WARM_UP_IMAGES;
@@ -346,6 +354,13 @@ impl Detector {
                 None => self.found_targets.push(FoundTarget::new(known.id, place)),
             }
         }
+    }
+
+    /// Whether the scene turns fast, by how far it has moved since the last image: at once where
+    /// that is more than the registration may be corrected by, else in the mean.
+    fn turns_fast(&self, moved_px: f64, interval: f64) -> bool {
+        let at_once = (FAST_TURN_PX_S * interval).max(CORRECTION_PX);
+        moved_px > at_once || self.turning[0].hypot(self.turning[1]) > FAST_TURN_PX_S
     }
 
     /// Where most of what moves moves alike, that is the scene: the distance of such candidates
