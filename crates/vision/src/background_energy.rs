@@ -20,7 +20,9 @@ const NOISE_SDS: f32 = 3.0;
 /// has, as the placements beside the target show it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct BackgroundEnergy {
-    /// Its mean, and the standard deviation of the noise's energy on top: no background is emptier.
+    /// Its mean, of which the greatest that the gate shows is the expected greatest, and the standard
+    /// deviation of the noise's energy on top: no background is emptier. By the mean of what the
+    /// gate shows a cloud's edge stands alone in its sky.
     mean: f32,
     /// Energy that noise may have.
     noise: f32,
@@ -42,29 +44,24 @@ impl BackgroundEnergy {
         is_inside: impl Fn([usize; 2]) -> bool,
     ) -> Option<Self> {
         let pixels = (sides[0] * sides[1]) as f32;
-        let (mut sum, mut count) = (0.0_f64, 0_usize);
+        let mut most = None;
         for y in 0..variances.height() {
             let is_beside_row = y.abs_diff(best[1]) >= sides[1];
             for (x, variance) in variances.row(y).iter().enumerate() {
                 if (is_beside_row || x.abs_diff(best[0]) >= sides[0]) && is_inside([x, y]) {
-                    sum += f64::from(*variance);
-                    count += 1;
+                    most = Some(variance.max(most.unwrap_or(0.0)));
                 }
             }
         }
-        if count == 0 {
-            return None;
-        }
-        let excess = ((sum / count as f64) as f32 - noise) * pixels;
+        let most = most?;
         // The noise's energy varies by v sqrt(2 n).
         let noise_sd = noise * (2.0 * pixels).sqrt();
+        let of_noise = pixels * noise + NOISE_SDS * noise_sd;
         let gate = (variances.width() + sides[0] - 1) * (variances.height() + sides[1] - 1);
-        Some(Self {
-            mean: excess.max(0.0) + noise_sd,
-            noise: pixels * noise + NOISE_SDS * noise_sd,
-            pixels,
-            boxes: gate as f32 / pixels - 1.0,
-        })
+        let boxes = gate as f32 / pixels - 1.0;
+        // The greatest of n exponential energies of mean m is about m ln n.
+        let mean = (most * pixels - of_noise).max(0.0) / (1.0 + boxes).ln();
+        Some(Self { mean: mean + noise_sd, noise: of_noise, pixels, boxes })
     }
 
     /// The logarithm of the probability that the background has no less energy than a variance under
@@ -177,15 +174,15 @@ mod tests {
 
     #[test]
     fn what_lies_outside_the_image_says_nothing() {
-        // Beyond the image its border is continued, without noise.
-        let gate = gate(1, checks);
-        let variances = variances(&Plane::from_fn(41, 31, |x, y| gate.row(y)[x.max(20)]));
+        // What stands out at the left lies outside.
+        let gate = gate(1, |x, y| if x < 10 { checks(x, y) } else { 0.0 });
+        let variances = variances(&gate);
         let beside = |is_inside: fn([usize; 2]) -> bool| {
             BackgroundEnergy::beside([24, 12], SIDES, NOISE, &variances, is_inside)
         };
-        let inside = beside(|[x, _]| x >= 16).unwrap();
+        let inside = beside(|[x, _]| x >= 10).unwrap();
         let all = beside(|_| true).unwrap();
-        assert!(inside.mean > 1.05 * all.mean, "{inside:?}, {all:?}");
+        assert!(2.0 * inside.mean < all.mean, "{inside:?}, {all:?}");
         assert!(beside(|_| false).is_none());
     }
 }
