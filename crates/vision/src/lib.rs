@@ -27,7 +27,6 @@
 
 mod appearance;
 mod arrival;
-mod background_energy;
 mod centring;
 mod coarse;
 mod coarse_picture;

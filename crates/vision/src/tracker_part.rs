@@ -24,8 +24,6 @@ pub enum TrackerPart {
     /// Several motion models, from constant velocity to the liveliest; without them all of the
     /// weight is on the liveliest.
     MotionModels,
-    /// What stands out more than all else in the gate is hardly background.
-    BackgroundEnergy,
     /// The measurement noise is matched to the innovations.
     MatchedNoise,
     /// Several places are followed while none is sure.
@@ -50,7 +48,7 @@ pub enum TrackerPart {
 
 impl TrackerPart {
     /// All parts.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 17] = [
         Self::Figure,
         Self::MeanFigure,
         Self::LearntReference,
@@ -58,7 +56,6 @@ impl TrackerPart {
         Self::Shape,
         Self::FollowedContrast,
         Self::MotionModels,
-        Self::BackgroundEnergy,
         Self::MatchedNoise,
         Self::SeveralPlaces,
         Self::CameraTurns,
@@ -82,7 +79,6 @@ impl fmt::Display for TrackerPart {
             Self::Shape => "size and direction are followed",
             Self::FollowedContrast => "the contrast is followed",
             Self::MotionModels => "several motion models",
-            Self::BackgroundEnergy => "the background's energy",
             Self::MatchedNoise => "noise matched to innovations",
             Self::SeveralPlaces => "several places while in doubt",
             Self::CameraTurns => "turns of the camera",

@@ -188,15 +188,12 @@ fn turn(speed: f64, seed: u64) -> (f64, f64) {
 fn what_a_camera_turns_over_is_no_swarm() {
     let turns = [(60.0, 1), (150.0, 2), (150.0, 3), (400.0, 4)];
     let outcomes = turns.map(|(speed, seed)| turn(speed, seed));
-    for (turn, (elsewhere, _)) in turns.iter().zip(&outcomes) {
+    for (turn, (elsewhere, covered)) in turns.iter().zip(&outcomes) {
+        assert!(*covered > 0.85, "{turn:?}: {outcomes:?}");
         // What comes in at the image's edge may be found before enough moves with it: one thing per
         // turn, until the end of the scene. All that is turned over would be 5 per image.
         assert!(*elsewhere < 1.0, "{turn:?}: {outcomes:?}");
     }
-    // Of 48 other turns the mean is 0.93, the standard deviation 0.05 and the least 0.63 (a spot
-    // hides the drone); the mean of four lies below 0.88 once in forty times.
-    let covered = outcomes.map(|(_, covered)| covered).iter().sum::<f64>() / outcomes.len() as f64;
-    assert!(covered > 0.88, "{outcomes:?}");
 }
 
 #[test]
