@@ -27,6 +27,7 @@
 
 mod appearance;
 mod arrival;
+mod background_energy;
 mod centring;
 mod coarse;
 mod coarse_picture;

@@ -24,6 +24,8 @@ pub enum TrackerPart {
     /// Several motion models, from constant velocity to the liveliest; without them all of the
     /// weight is on the liveliest.
     MotionModels,
+    /// What stands out more than all else in the gate is hardly background.
+    BackgroundEnergy,
     /// The measurement noise is matched to the innovations.
     MatchedNoise,
     /// Several places are followed while none is sure.
@@ -48,7 +50,7 @@ pub enum TrackerPart {
 
 impl TrackerPart {
     /// All parts.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 18] = [
         Self::Figure,
         Self::MeanFigure,
         Self::LearntReference,
@@ -56,6 +58,7 @@ impl TrackerPart {
         Self::Shape,
         Self::FollowedContrast,
         Self::MotionModels,
+        Self::BackgroundEnergy,
         Self::MatchedNoise,
         Self::SeveralPlaces,
         Self::CameraTurns,
@@ -79,6 +82,7 @@ impl fmt::Display for TrackerPart {
             Self::Shape => "size and direction are followed",
             Self::FollowedContrast => "the contrast is followed",
             Self::MotionModels => "several motion models",
+            Self::BackgroundEnergy => "the background's energy",
             Self::MatchedNoise => "noise matched to innovations",
             Self::SeveralPlaces => "several places while in doubt",
             Self::CameraTurns => "turns of the camera",

@@ -41,12 +41,6 @@ const LEAST_GAIN: f64 = 0.1;
 /// half of it a drawn target in noise is lost in 20 % of its frames instead of 2, and something
 /// else taken for it for four seconds.
 const MOST_IN_DOUBT: usize = 20_000;
-/// Certainty above which the rest of the gate is not looked at: what is there could take no more
-/// from it than this leaves. With 0.9 a tenth of it could, and then
-/// the place is not sure. With half of it the rest of the gate is left out where it has the target
-/// once in two times.
-const SURE: f64 = 0.99;
-
 /// A target under track.
 #[derive(Clone, Debug)]
 pub(crate) struct ImageTarget {
@@ -203,9 +197,9 @@ impl ImageTarget {
         };
         let middle = middle.map(|half| Region::about(&self.state, half));
         let sure = middle.map(|middle| (self.state.posterior(frame, middle, scratch), middle));
-        let (posterior, region) = match sure.filter(|(posterior, _)| posterior.near.mass > SURE) {
+        let (posterior, region) = match sure.filter(|(posterior, _)| posterior.is_sure()) {
             Some(sure) => sure,
-            None => (self.state.posterior(frame, whole, scratch), whole),
+            None => (self.state.posterior_of_gate(frame, whole, scratch), whole),
         };
         if self.has_several_places(&posterior, config) {
             return self.follow_hypotheses(frame, region, scratch);
