@@ -51,6 +51,14 @@ const LEAST_FREE: f64 = 0.25;
 /// exactly by brightness and contrast, and never change.
 const LEAST_PIXELS: f64 = 4.0;
 
+/// Least reach within which the same thing is looked for elsewhere, px: less is within the
+/// registration's error. With half of it every turn of a few pixels costs dozens of comparisons.
+const LEAST_REACH_PX: f64 = 1.0;
+/// First step of that search, px, and its last: a mast, or what else is as thin as a small target,
+/// is found in steps of two pixels, and its edge fits to half a pixel. With half of the first it
+/// costs four times as much, with half of the second a quarter more.
+const STEPS_PX: [f64; 2] = [2.0, 0.5];
+
 /// The reference's place now, compared with that in a picture of the scene without the target.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ArrivalEvidence {
@@ -73,6 +81,17 @@ pub(crate) struct ComparisonBuffers {
     before: Plane,
 }
 
+/// Where a picture of the scene may show what is in a place now.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PlaceThen<'a> {
+    pub(crate) picture: &'a ScenePicture,
+    pub(crate) place: ImagePoint,
+    /// How far from there it may have been, px per axis.
+    pub(crate) reach_px: f64,
+    /// Where the target was seen in that picture.
+    pub(crate) seen: Option<ImagePoint>,
+}
+
 /// A reference in a place of an image, with the variance of the image's noise.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PlacedReference<'a> {
@@ -81,6 +100,8 @@ pub(crate) struct PlacedReference<'a> {
     pub(crate) energy: f64,
     pub(crate) place: ImagePoint,
     pub(crate) noise: f64,
+    /// The contrast that the target usually has.
+    pub(crate) usual: f64,
 }
 
 impl ArrivalEvidence {
@@ -90,10 +111,15 @@ impl ArrivalEvidence {
     /// If the target has come, the scene had any contrast c there before, `c ~ N(0, (usual /
     /// 2)^2)`. If not, it had the one that is there now, and no pixel has changed.
     pub(crate) fn log_ratio(self, usual: f64) -> f64 {
+        let by_contrast = self.contrast_log_ratio(usual, UNCHANGED);
+        (by_contrast + self.changed().min(MOST)).clamp(-MOST, MOST)
+    }
+
+    /// Log-likelihood ratio of the pixels having changed: `k / 2 (r - 1 - ln r)` for k samples with
+    /// r times their expected variance.
+    fn changed(self) -> f64 {
         let Self { change, samples, .. } = self;
-        // k / 2 (r - 1 - ln r): likelihood ratio of k samples with r times their expected variance.
-        let changed = if change > 1.0 { samples / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
-        (self.contrast_log_ratio(usual, UNCHANGED) + changed.min(MOST)).clamp(-MOST, MOST)
+        if change > 1.0 { samples / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 }
     }
 
     /// The same ratio against something that lies on the lens, or is written into the video: the
@@ -126,17 +152,47 @@ impl ComparisonBuffers {
         replace_invalid(&mut self.now);
     }
 
-    /// Compares that sample with what a picture has at the place `then`. Pixels where the target
-    /// was `seen` in that picture do not count; `None` if these are nearly all, or the place was
-    /// outside the picture.
+    /// Compares that sample with what a picture has: in the place within reach where it is likeliest
+    /// the same. Pixels where the target was seen in that picture do not count; `None` if these are
+    /// nearly all, or the place was outside the picture.
     pub(crate) fn with(
         &mut self,
-        picture: &ScenePicture,
-        then: ImagePoint,
-        seen: Option<ImagePoint>,
+        then: PlaceThen<'_>,
         placed: PlacedReference<'_>,
         resampler: &mut Resampler,
     ) -> Option<ArrivalEvidence> {
+        let come =
+            |it: ArrivalEvidence| it.contrast_log_ratio(placed.usual, UNCHANGED) + it.changed();
+        let mut nearest = (then.place, self.at(then, placed, resampler)?);
+        if then.reach_px < LEAST_REACH_PX || come(nearest.1) < 0.0 {
+            return Some(nearest.1);
+        }
+        // The likeliest of all places counts: where exactly it was is not what is asked.
+        let [mut step, last] = STEPS_PX;
+        let mut steps = (then.reach_px / step).ceil() as i32;
+        while step >= last {
+            let about = nearest.0;
+            let along = || (-steps..=steps).map(|by| step * f64::from(by));
+            for [right, down] in along().flat_map(|down| along().map(move |right| [right, down])) {
+                let place = ImagePoint { x: about.x + right, y: about.y + down };
+                let there = self.at(PlaceThen { place, ..then }, placed, resampler);
+                if let Some(there) = there.filter(|there| come(*there) < come(nearest.1)) {
+                    nearest = (place, there);
+                }
+            }
+            (step, steps) = (step / 2.0, 1);
+        }
+        Some(nearest.1)
+    }
+
+    /// Compares that sample with what a picture has in one place.
+    fn at(
+        &mut self,
+        then: PlaceThen<'_>,
+        placed: PlacedReference<'_>,
+        resampler: &mut Resampler,
+    ) -> Option<ArrivalEvidence> {
+        let PlaceThen { picture, place: then, seen, .. } = then;
         let PlacedReference { reference, energy, noise, .. } = placed;
         if !picture.holds(then) {
             return None;

@@ -2,7 +2,7 @@
 //! which was there before.
 
 use crate::ImagePoint;
-use crate::arrival::PlacedReference;
+use crate::arrival::{PlaceThen, PlacedReference};
 use crate::fit::TargetFit;
 use crate::frame::FrameInput;
 use crate::motion::ImageMotion;
@@ -46,6 +46,15 @@ const MOST: f64 = 2.0;
 /// Images that are closer together than this count as no more than one, s: blur and compression
 /// last from one to the next. With half of it sixty images a second count twice as much as thirty.
 const NEWS_S: f64 = 1.0 / 30.0;
+/// Share of a camera's turn by which a place may have moved more or less than the turn that was
+/// found: one shift describes a turn, but it moves the edges of a picture of 60 degrees by a third
+/// more than its middle, `1 + tan^2 30`. With half of it and with twice of it as much of the drawn
+/// targets before a pan is lost; with none of it a mast is shown for the target for six seconds.
+const UNEVEN_TURN: f64 = 0.2;
+/// Farthest that a place is looked for from where it should be, px: a turn by 80 px, farther than
+/// which few pictures reach back. With twice as much a comparison costs four times as much, and
+/// half of it is too little for a turn of more than 40 px.
+const MOST_UNEVEN_PX: f64 = 16.0;
 /// Number of the scene's pictures in which a target remembers its place: more than there are. With
 /// half of it the same.
 const MOST_PICTURES: usize = 16;
@@ -153,23 +162,26 @@ impl TargetIdentity {
             energy: f64::from(state.appearance.energy()),
             place,
             noise: f64::from(state.noise),
+            usual: state.usual_contrast * f64::from(state.appearance.clear_share()),
         };
         let longest = placed.reference.width().max(placed.reference.height()) as f64;
         let Scratch { buffers, comparison, .. } = scratch;
         comparison.take(frame.image, placed, &mut buffers.resampler);
-        let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
         // It has moved on from a picture's time if its speed would have taken it farther than its
-        // length since.
+        // length since, and out of reach of its place.
         let speed = self.speed_px_s.max(self.least_speed(state, frame, place));
         let mut against = |picture: &ScenePicture, then: ImagePoint| {
             let seen = self.place_in(picture);
-            let has_moved_on = speed * picture.age_s() > longest;
+            let turned_px = (then.x - place.x).hypot(then.y - place.y);
+            let reach_px = (UNEVEN_TURN * turned_px).min(MOST_UNEVEN_PX);
+            let has_moved_on = speed * picture.age_s() > longest + reach_px;
             // A picture counts only if the target was elsewhere in it: at a place that is known, or
             // lost and gone on since.
             if seen.is_none() && !(self.was_lost(state, picture) && has_moved_on) {
                 return None;
             }
-            comparison.with(picture, then, seen, placed, &mut buffers.resampler)
+            let then = PlaceThen { picture, place: then, reach_px, seen };
+            comparison.with(then, placed, &mut buffers.resampler)
         };
         let pictures = || frame.scene.pictures();
         let scene = pictures().find_map(|picture| against(picture, picture.then(place)));
@@ -177,9 +189,9 @@ impl TargetIdentity {
         let has_turned = |then: ImagePoint| (then.x - place.x).hypot(then.y - place.y) > longest;
         let mut turned = pictures().filter(|picture| has_turned(picture.then(place)));
         let lens = turned.find_map(|picture| against(picture, place));
-        let scene = scene.map_or(0.0, |arrival| arrival.log_ratio(usual));
+        let scene = scene.map_or(0.0, |arrival| arrival.log_ratio(placed.usual));
         // The worse of both: it must have come into the scene and must not be on the lens.
-        lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(usual)))
+        lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(placed.usual)))
     }
 
     fn place_in(&self, picture: &ScenePicture) -> Option<ImagePoint> {
