@@ -54,9 +54,13 @@ const LEAST_PIXELS: f64 = 4.0;
 /// Least reach within which the same thing is looked for elsewhere, px: less is within the
 /// registration's error. With half of it every turn of a few pixels costs dozens of comparisons.
 const LEAST_REACH_PX: f64 = 1.0;
-/// First step of that search, px, and its last: a mast, or what else is as thin as a small target,
-/// is found in steps of two pixels, and its edge fits to half a pixel. With half of the first it
-/// costs four times as much, with half of the second a quarter more.
+/// Steps of that search in a shorter side of the reference: what it is the same as shows a quarter
+/// of a side away. With half of it a mast is missed between two steps; with twice as much the
+/// search costs four times as much.
+const STEPS_IN_SIDE: f64 = 4.0;
+/// Least first step, px, and the last one: as thin as the smallest target is, 4 px, and as well as
+/// an edge fits. With half of the first a small target's search costs four times as much, with half
+/// of the last each search 9 comparisons more.
 const STEPS_PX: [f64; 2] = [2.0, 0.5];
 
 /// The reference's place now, compared with that in a picture of the scene without the target.
@@ -100,7 +104,7 @@ pub(crate) struct PlacedReference<'a> {
     pub(crate) energy: f64,
     pub(crate) place: ImagePoint,
     pub(crate) noise: f64,
-    /// The contrast that the target usually has.
+    /// The contrast that the target usually has in this reference, of which noise is a part.
     pub(crate) usual: f64,
 }
 
@@ -152,9 +156,10 @@ impl ComparisonBuffers {
         replace_invalid(&mut self.now);
     }
 
-    /// Compares that sample with what a picture has: in the place within reach where it is likeliest
-    /// the same. Pixels where the target was seen in that picture do not count; `None` if these are
-    /// nearly all, or the place was outside the picture.
+    /// Compares that sample with what a picture has: in the place where it should be, and where
+    /// that says that it has come, in the place within reach where it is likeliest the same. Pixels
+    /// where the target was seen in that picture do not count; `None` if these are nearly all, or
+    /// the place where it should be was outside the picture.
     pub(crate) fn with(
         &mut self,
         then: PlaceThen<'_>,
@@ -167,14 +172,19 @@ impl ComparisonBuffers {
         if then.reach_px < LEAST_REACH_PX || come(nearest.1) < 0.0 {
             return Some(nearest.1);
         }
-        // The likeliest of all places counts: where exactly it was is not what is asked.
-        let [mut step, last] = STEPS_PX;
+        let [least, last] = STEPS_PX;
+        let side = placed.reference.width().min(placed.reference.height()) as f64;
+        let mut step = (side / STEPS_IN_SIDE).max(least);
         let mut steps = (then.reach_px / step).ceil() as i32;
         while step >= last {
             let about = nearest.0;
             let along = || (-steps..=steps).map(|by| step * f64::from(by));
             for [right, down] in along().flat_map(|down| along().map(move |right| [right, down])) {
                 let place = ImagePoint { x: about.x + right, y: about.y + down };
+                let off = [place.x - then.place.x, place.y - then.place.y];
+                if off.iter().any(|off| off.abs() > then.reach_px) {
+                    continue;
+                }
                 let there = self.at(PlaceThen { place, ..then }, placed, resampler);
                 if let Some(there) = there.filter(|there| come(*there) < come(nearest.1)) {
                     nearest = (place, there);

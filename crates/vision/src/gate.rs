@@ -198,8 +198,8 @@ impl TargetBelief {
         scratch.map.of(&scratch.ratios, &prior)
     }
 
-    /// Takes from the log likelihood ratios the logarithm of the probability that background has the
-    /// energy there; what lies beside the likeliest placement shows how much it has.
+    /// Takes from the log likelihood ratios the logarithm of the probability that background has
+    /// the energy there; what lies beside the likeliest placement shows how much it has.
     fn weigh_background(&self, scratch: &mut Scratch) {
         let Scratch { statistics, ratios, .. } = scratch;
         let greatest = lanes::greatest(ratios.samples());

@@ -11,9 +11,10 @@ use pulp::{Arch, Simd, WithSimd};
 
 use crate::lanes;
 
-/// Certainty above which nothing more is looked at, such as the rest of the gate: it could take no
-/// more from it than this leaves. With 0.9 it could take a tenth, and then the place is not sure.
-/// With half of it the rest of the gate is left out where it has the target once in two times.
+/// Certainty of a place above which nothing more is looked at, such as the rest of the gate: that
+/// could take no more from the certainty than it lacks of 1. With 0.9 it could take a tenth, and
+/// the place would not be sure. With half of it the rest of the gate is left out where it has the
+/// target once in two times.
 const SURE: f64 = 0.99;
 
 /// Prior of the place, before the image is looked at: a Gaussian per axis, and a share that may be

@@ -41,6 +41,7 @@ const LEAST_GAIN: f64 = 0.1;
 /// half of it a drawn target in noise is lost in 20 % of its frames instead of 2, and something
 /// else taken for it for four seconds.
 const MOST_IN_DOUBT: usize = 20_000;
+
 /// A target under track.
 #[derive(Clone, Debug)]
 pub(crate) struct ImageTarget {
