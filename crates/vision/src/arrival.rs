@@ -96,6 +96,12 @@ pub(crate) struct PlaceThen<'a> {
     pub(crate) seen: Option<ImagePoint>,
 }
 
+impl PlaceThen<'_> {
+    fn reaches(&self, ImagePoint { x, y }: ImagePoint) -> bool {
+        (x - self.place.x).abs() <= self.reach_px && (y - self.place.y).abs() <= self.reach_px
+    }
+}
+
 /// A reference in a place of an image, with the variance of the image's noise.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PlacedReference<'a> {
@@ -117,6 +123,11 @@ impl ArrivalEvidence {
     pub(crate) fn log_ratio(self, usual: f64) -> f64 {
         let by_contrast = self.contrast_log_ratio(usual, UNCHANGED);
         (by_contrast + self.changed().min(MOST)).clamp(-MOST, MOST)
+    }
+
+    /// The same ratio without limits, by which places are compared.
+    fn unlimited_log_ratio(self, usual: f64) -> f64 {
+        self.contrast_log_ratio(usual, UNCHANGED) + self.changed()
     }
 
     /// Log-likelihood ratio of the pixels having changed: `k / 2 (r - 1 - ln r)` for k samples with
@@ -166,33 +177,47 @@ impl ComparisonBuffers {
         placed: PlacedReference<'_>,
         resampler: &mut Resampler,
     ) -> Option<ArrivalEvidence> {
-        let come =
-            |it: ArrivalEvidence| it.contrast_log_ratio(placed.usual, UNCHANGED) + it.changed();
-        let mut nearest = (then.place, self.at(then, placed, resampler)?);
-        if then.reach_px < LEAST_REACH_PX || come(nearest.1) < 0.0 {
-            return Some(nearest.1);
+        let exact = self.at(then, placed, resampler)?;
+        let may_be_elsewhere = then.reach_px >= LEAST_REACH_PX;
+        if may_be_elsewhere && exact.unlimited_log_ratio(placed.usual) >= 0.0 {
+            return Some(self.likeliest_the_same(then, exact, placed, resampler));
         }
-        let [least, last] = STEPS_PX;
+        Some(exact)
+    }
+
+    /// The comparison with the place within reach that is likeliest the same; `exact` is that with
+    /// the middle of these.
+    fn likeliest_the_same(
+        &mut self,
+        then: PlaceThen<'_>,
+        exact: ArrivalEvidence,
+        placed: PlacedReference<'_>,
+        resampler: &mut Resampler,
+    ) -> ArrivalEvidence {
+        let [least_step, last_step] = STEPS_PX;
         let side = placed.reference.width().min(placed.reference.height()) as f64;
-        let mut step = (side / STEPS_IN_SIDE).max(least);
+        let mut step = (side / STEPS_IN_SIDE).max(least_step);
         let mut steps = (then.reach_px / step).ceil() as i32;
-        while step >= last {
-            let about = nearest.0;
+        let (mut middle, mut best) = (then.place, exact);
+        let mut least = exact.unlimited_log_ratio(placed.usual);
+        while step >= last_step {
+            let about = middle;
             let along = || (-steps..=steps).map(|by| step * f64::from(by));
             for [right, down] in along().flat_map(|down| along().map(move |right| [right, down])) {
                 let place = ImagePoint { x: about.x + right, y: about.y + down };
-                let off = [place.x - then.place.x, place.y - then.place.y];
-                if off.iter().any(|off| off.abs() > then.reach_px) {
+                if !then.reaches(place) {
                     continue;
                 }
-                let there = self.at(PlaceThen { place, ..then }, placed, resampler);
-                if let Some(there) = there.filter(|there| come(*there) < come(nearest.1)) {
-                    nearest = (place, there);
+                if let Some(there) = self.at(PlaceThen { place, ..then }, placed, resampler)
+                    && there.unlimited_log_ratio(placed.usual) < least
+                {
+                    (middle, best) = (place, there);
+                    least = there.unlimited_log_ratio(placed.usual);
                 }
             }
             (step, steps) = (step / 2.0, 1);
         }
-        Some(nearest.1)
+        best
     }
 
     /// Compares that sample with what a picture has in one place.

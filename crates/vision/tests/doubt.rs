@@ -82,8 +82,8 @@ fn bar([x, y]: [f32; 2], angle: f32) -> impl Fn(f32, f32) -> f32 {
 }
 
 /// In how many of 80 images, ten a second, a target is followed that is alone in the sky, and whose
-/// roll is another in each image, up to 50 degrees to either side.
-fn followed_while_it_rolls(seed: u64, config: TrackerConfig) -> usize {
+/// roll is another in each image, up to `most_rad` to either side.
+fn followed_while_it_rolls(seed: u64, most_rad: f32, config: TrackerConfig) -> usize {
     let mut scene = Scene::new(seed, 1.0, 1.5, 0.0);
     let mut tracker = ImageTracker::new(config).unwrap();
     tracker.take_up(PixelBox::about(ImagePoint { x: 60.0, y: 60.0 }, 17.0, 6.0));
@@ -95,19 +95,21 @@ fn followed_while_it_rolls(seed: u64, config: TrackerConfig) -> usize {
         let time = Timestamp::from_seconds(f64::from(image) / 10.0);
         let track = tracker.step(&picture, time)[0];
         followed += usize::from(track.phase == TrackPhase::Tracking && off(&track, at) < 4.0);
-        angle = scene.rng.random_range(-0.9..0.9_f32);
+        angle = scene.rng.random_range(-most_rad..most_rad);
     }
     followed
 }
 
 #[test]
 fn a_target_that_rolls_alone_in_the_sky_is_held_at_ten_images_a_second() {
-    let all = |part: Option<TrackerPart>| -> Vec<usize> {
+    let all = |most_rad: f32, part: Option<TrackerPart>| -> Vec<usize> {
         let config = TrackerConfig::default();
         let config = part.map_or(config.clone(), |part| config.without(part));
-        (0..8).map(|seed| followed_while_it_rolls(seed, config.clone())).collect()
+        (0..8).map(|seed| followed_while_it_rolls(seed, most_rad, config.clone())).collect()
     };
-    let (with, without) = (all(None), all(Some(TrackerPart::BackgroundEnergy)));
+    let less = all(0.7, None);
+    assert!(less.iter().all(|followed| *followed >= 72), "{less:?}");
+    let (with, without) = (all(0.9, None), all(0.9, Some(TrackerPart::BackgroundEnergy)));
     let sums = [&with, &without].map(|followed| followed.iter().sum::<usize>());
     // When it was written 587 of 640 were followed, and 556 without; none of the eight did worse.
     assert!(with.iter().all(|followed| *followed >= 64), "{with:?}");
