@@ -9,6 +9,7 @@ use crate::followed_target::ImageTarget;
 use crate::frame::{FrameInput, TargetStep};
 use crate::paper::PaperTarget;
 use crate::scratch::Scratch;
+use crate::state::TargetBelief;
 use crate::{
     ImagePoint, ImageTrack, ImageTrackId, PixelBox, TargetFeatures, TrackPhase, TrackerConfig,
 };
@@ -129,6 +130,14 @@ impl Follower {
 
     pub(crate) fn is_searching(&self) -> bool {
         matches!(self, Self::Posterior(target) if target.state.is_searching())
+    }
+
+    /// What is believed of the target; `None` of the papers' algorithms.
+    pub(crate) fn belief(&self) -> Option<&TargetBelief> {
+        match self {
+            Self::Posterior(target) => Some(&target.state),
+            Self::Paper(_) => None,
+        }
     }
 
     pub(crate) fn is_seen(&self) -> bool {

@@ -5,6 +5,7 @@ use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
 
 use crate::scene::SceneMemory;
+use crate::snapshot::BackgroundSnapshot;
 use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
 /// The next image, and what goes with it.
@@ -13,8 +14,8 @@ pub(crate) struct FrameInput<'a> {
     pub(crate) image: &'a Plane,
     /// Time since the image before, s.
     pub(crate) interval: f64,
-    /// A picture of a moment ago, in which every target was seen.
-    pub(crate) snapshot: Option<&'a Plane>,
+    /// A picture of a moment ago, in which every target but candidates was seen.
+    pub(crate) snapshot: Option<&'a BackgroundSnapshot>,
     /// What the scene looked like lately.
     pub(crate) scene: &'a SceneMemory,
     /// Shift of everything in the image since the scene was looked at last, as the camera turned,

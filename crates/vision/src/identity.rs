@@ -10,6 +10,7 @@ use crate::scene::ScenePicture;
 use crate::scratch::Scratch;
 use crate::state::TargetBelief;
 use crate::tracker_part::TrackerPart;
+use crate::uneven_turn;
 
 /// How long a target that was found again must have been seen before it is believed, s: until then
 /// a mistake costs what is known of where it went, and nothing is learnt of it. With half of it a
@@ -46,16 +47,6 @@ const MOST: f64 = 2.0;
 /// Images that are closer together than this count as no more than one, s: blur and compression
 /// last from one to the next. With half of it sixty images a second count twice as much as thirty.
 const NEWS_S: f64 = 1.0 / 30.0;
-/// Share of a camera's turn by which a place may have moved more or less than the turn that was
-/// found: one shift describes a turn, but it moves the edges of a picture of 60 degrees by a third
-/// more than its middle, `1 + tan^2 30`. Of eight drawn targets before a pan 74 % of the images are
-/// followed with it, with twice of it the same and with half of it 73; with none of it 54, and a
-/// mast is shown for the target for up to six seconds.
-const UNEVEN_TURN: f64 = 0.2;
-/// Farthest that a place is looked for from where it should be, px: that of a turn by 80 px. With
-/// twice as much the search costs four times as much; half of it is too little for a turn of more
-/// than 40 px.
-const MOST_UNEVEN_PX: f64 = 16.0;
 /// Number of the scene's pictures in which a target remembers its place: more than there are. With
 /// half of it the same.
 const MOST_PICTURES: usize = 16;
@@ -173,8 +164,9 @@ impl TargetIdentity {
         let speed = self.speed_px_s.max(self.least_speed(state, frame, place));
         let mut against = |picture: &ScenePicture, then: ImagePoint| {
             let seen = self.place_in(picture);
-            let turned_px = (then.x - place.x).hypot(then.y - place.y);
-            let reach_px = (UNEVEN_TURN * turned_px).min(MOST_UNEVEN_PX);
+            // After a turn by more than that reaches, what is found nowhere is taken to have come
+            // all the same: a target over which a camera turns fast has no other evidence.
+            let reach_px = uneven_turn::reach_px([then.x - place.x, then.y - place.y]);
             let has_moved_on = speed * picture.age_s() > longest + reach_px;
             // A picture counts only if the target was elsewhere in it: at a place that is known, or
             // lost and gone on since.

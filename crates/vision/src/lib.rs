@@ -34,6 +34,7 @@ mod coarse_picture;
 mod config;
 mod crop;
 mod detector;
+mod empty_scene;
 mod features;
 mod figure;
 mod finding;
@@ -61,10 +62,12 @@ mod search;
 mod search_area;
 mod search_memory;
 mod sighting;
+mod snapshot;
 mod state;
 mod surroundings;
 mod tracker;
 mod tracker_part;
+mod uneven_turn;
 
 use std::fmt;
 

@@ -4,6 +4,7 @@ use crossfix_correlation::{Correlator, Plane, Statistics};
 
 use crate::appearance::AppearanceScratch;
 use crate::arrival::ComparisonBuffers;
+use crate::empty_scene::EmptySceneBuffers;
 use crate::noise::NoiseMeter;
 use crate::place_map::SpreadBuffers;
 use crate::posterior::PosteriorMap;
@@ -30,4 +31,5 @@ pub(crate) struct SearchScratch {
     pub(crate) change: Plane,
     pub(crate) contrasts: Vec<f32>,
     pub(crate) spread: SpreadBuffers,
+    pub(crate) empty_scene: EmptySceneBuffers,
 }

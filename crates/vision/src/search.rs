@@ -26,6 +26,7 @@ use crossfix_correlation::Plane;
 use crate::TrackerConfig;
 use crate::coarse::{CoarseReference, PictureLikeness, coarsened};
 use crate::crop::{crop, replace_invalid};
+use crate::empty_scene::Background;
 use crate::fit::TargetFit;
 use crate::frame::FrameInput;
 use crate::identity::TargetIdentity;
@@ -33,7 +34,7 @@ use crate::likelihood::log_ratios;
 use crate::place_map::PlaceMap;
 use crate::scratch::Scratch;
 use crate::search_area::{BestCell, SearchArea};
-use crate::search_memory::{Background, SearchMap, SearchMemory};
+use crate::search_memory::{SearchMap, SearchMemory};
 use crate::state::TargetBelief;
 use crate::tracker_part::TrackerPart;
 
@@ -117,15 +118,20 @@ impl Sought<'_> {
     /// cloud is found in the first image, and not in the second.
     fn find_in_image(&mut self, frame: FrameInput<'_>, scratch: &mut Scratch) -> Option<TargetFit> {
         let coarse = CoarseReference::of(self.state, frame.image, scratch)?;
-        self.remember_background(frame, &coarse, scratch);
+        if frame.config.has(TrackerPart::EmptyScene) {
+            self.remember_background(frame, &coarse, scratch);
+        }
         let (sides, likeness) =
             whole_ratios(self.state, frame.image, &coarse, frame.config, scratch);
         let area = SearchArea::whole(self.state, sides, coarse.coarseness);
         let turned = frame.scene.turned();
-        let seen = self.state.in_snapshot.filter(|_| frame.config.has(TrackerPart::EmptyScene));
-        if let Some(scene) = seen.and_then(|at| area.empty_scene(sides, turned, at, self.memory)) {
-            scene.subtract_from(&mut scratch.ratios);
+        let empty = self.memory.background.as_ref();
+        let empty = empty.map(|known| known.seen_at(turned, &mut scratch.search.empty_scene));
+        if let Some(empty) = &empty {
+            empty.subtract_from(&mut scratch.ratios);
         }
+        let best = area.best_cell(&area.prior(self.state, frame.config), &scratch.ratios);
+        let of_scene = empty.map_or(0.0, |empty| empty.at(best.cell));
         let near = area.near();
         let map = self.predicted_map(frame, &area, sides, scratch);
         map.update(&scratch.ratios);
@@ -133,10 +139,7 @@ impl Sought<'_> {
         let searched = Searched { picture: frame.image, noise: self.state.noise, likeness };
         let is_sure = likeliest.probability >= SURE_PLACE;
         if !is_sure {
-            let best = area.best_cell(&area.prior(self.state, frame.config), scratch);
-            let scene = seen.and_then(|at| area.empty_scene(sides, turned, at, self.memory));
-            let background = scene.map_or(0.0, |scene| scene.at(best.cell));
-            return self.clear_find(frame, searched, &area, best, background, scratch);
+            return self.clear_find(frame, searched, &area, best, of_scene, scratch);
         }
         let cell = [likeliest.column, likeliest.row];
         let (place, reach) = (area.place_of(cell), 2 * area.coarseness + 1);
@@ -181,12 +184,12 @@ impl Sought<'_> {
         let expected = coarse.expectation(state, noise, config);
         log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
         let searched = Searched { picture: change, noise, likeness: coarse.likeness(scratch) };
-        let best = area.best_cell(&area.prior(state, config), scratch);
+        let best = area.best_cell(&area.prior(state, config), &scratch.ratios);
         self.clear_find(frame, searched, &area, best, 0.0, scratch)
     }
 
     /// The target at the best place of one picture, if that is clearly its place. `background` is
-    /// the scene's own log likelihood ratio there.
+    /// the scene's own log likelihood ratio there or within reach.
     fn clear_find(
         &mut self,
         frame: FrameInput<'_>,
@@ -283,13 +286,16 @@ impl Sought<'_> {
         scratch: &mut Scratch,
     ) {
         let coarseness = coarse.coarseness;
-        let background = &mut self.memory.background;
-        let is_known = background.as_ref().is_some_and(|known| known.coarseness == coarseness);
-        let snapshot = frame.snapshot.filter(|_| !is_known && self.state.in_snapshot.is_some());
+        let known = self.memory.background.as_ref();
+        if known.is_some_and(|known| known.coarseness() == coarseness) {
+            return;
+        }
+        let snapshot = frame.snapshot.filter(|_| self.state.is_in_snapshot);
         let Some(snapshot) = snapshot else { return };
-        whole_ratios(self.state, snapshot, coarse, frame.config, scratch);
-        let (ratios, turned) = (scratch.ratios.clone(), frame.scene.turned());
-        *background = Some(Background { coarseness, ratios, turned });
+        let (sides, _) = whole_ratios(self.state, &snapshot.picture, coarse, frame.config, scratch);
+        let area = SearchArea::whole(self.state, sides, coarseness);
+        self.memory.background =
+            Some(Background::new(&scratch.ratios, &area, &snapshot.seen, snapshot.turned));
     }
 }
 

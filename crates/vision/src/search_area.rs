@@ -1,13 +1,11 @@
 //! The area of a coarse picture in which a lost target is searched for: its cells, how likely each
-//! is before the picture is looked at, and what the scene without the target looked like there.
+//! is before the picture is looked at.
 
 use std::ops::Range;
 
 use crossfix_correlation::Plane;
 
 use crate::lanes::greatest;
-use crate::scratch::Scratch;
-use crate::search_memory::SearchMemory;
 use crate::state::TargetBelief;
 use crate::{ImagePoint, TrackerConfig};
 
@@ -42,47 +40,6 @@ impl AreaPrior {
     }
 }
 
-/// The scene without the target, as a search sees it.
-pub(crate) struct EmptyScene<'a> {
-    /// The scene's own log likelihood ratios, in the picture that was taken of it.
-    ratios: &'a Plane,
-    /// By how many cells it has moved since.
-    by: [isize; 2],
-    /// Columns and rows of the cells that the target hid then.
-    hidden: [Range<usize>; 2],
-}
-
-impl EmptyScene<'_> {
-    /// The scene's own ratio in a cell; 0 where the target hid it, and where it is unlike the
-    /// target.
-    pub(crate) fn at(&self, [column, row]: [usize; 2]) -> f32 {
-        if self.hidden[0].contains(&column) && self.hidden[1].contains(&row) {
-            return 0.0;
-        }
-        let [column, row] = [0, 1].map(|i| ([column, row][i] as isize).saturating_add(self.by[i]));
-        self.ratios.clamped(column, row).max(0.0)
-    }
-
-    /// Subtracts the scene's own ratios: the reference found this much of the target in the empty
-    /// scene already.
-    pub(crate) fn subtract_from(&self, ratios: &mut Plane) {
-        let last = [self.ratios.width(), self.ratios.height()].map(|side| side as isize - 1);
-        let width = ratios.width();
-        for y in 0..ratios.height() {
-            let scene =
-                self.ratios.row((y as isize).saturating_add(self.by[1]).clamp(0, last[1]) as usize);
-            let hidden = if self.hidden[1].contains(&y) { self.hidden[0].clone() } else { 0..0 };
-            let row = ratios.row_mut(y);
-            for columns in [0..hidden.start, hidden.end..width] {
-                for (x, ratio) in columns.clone().zip(&mut row[columns]) {
-                    let column = (x as isize).saturating_add(self.by[0]).clamp(0, last[0]) as usize;
-                    *ratio -= scene[column].max(0.0);
-                }
-            }
-        }
-    }
-}
-
 /// The area in which a target is searched for.
 pub(crate) struct SearchArea {
     /// Columns and rows of the coarse picture.
@@ -107,6 +64,14 @@ impl SearchArea {
             sides: [working.width(), working.height()],
             coarseness,
         }
+    }
+
+    /// All of a coarse picture of these sides, for a reference with sides in px, where nothing is
+    /// predicted.
+    #[cfg(test)]
+    pub(crate) fn with_sides(picture: [usize; 2], sides: [usize; 2], coarseness: usize) -> Self {
+        let ranges = picture.map(|side| 0..side);
+        Self { ranges, predicted: [0.0; 2], half: [1.0; 2], sides, coarseness }
     }
 
     /// What is about the predicted place: the more, the longer the target has not been seen.
@@ -147,13 +112,13 @@ impl SearchArea {
         }
     }
 
-    /// The likeliest place, by the log likelihood ratios in `scratch.ratios`.
-    pub(crate) fn best_cell(&self, prior: &AreaPrior, scratch: &Scratch) -> BestCell {
+    /// The likeliest place, by the log likelihood ratios of its cells.
+    pub(crate) fn best_cell(&self, prior: &AreaPrior, log_ratios: &Plane) -> BestCell {
         let Self { ranges, .. } = self;
         let (mut best, mut most) = ([0, 0], f64::NEG_INFINITY);
         let most_prior = prior.most().ln();
         for (y, row) in ranges[1].clone().enumerate() {
-            let ratios = scratch.ratios.row(y);
+            let ratios = log_ratios.row(y);
             // If even the largest prior does not reach the best, the row and the logarithm are
             // spared.
             if f64::from(greatest(ratios)) + most_prior <= most {
@@ -173,8 +138,8 @@ impl SearchArea {
         let near = self.near();
         // The next best place, away from the best, for the margin.
         let mut rival = f32::NEG_INFINITY;
-        for y in 0..scratch.ratios.height() {
-            let row = scratch.ratios.row(y);
+        for y in 0..log_ratios.height() {
+            let row = log_ratios.row(y);
             let beside = if y.abs_diff(best[1]) > near[1] {
                 greatest(row)
             } else {
@@ -185,35 +150,19 @@ impl SearchArea {
             rival = rival.max(beside);
         }
         let (column, row) = (ranges[0].start + best[0], ranges[1].start + best[1]);
-        BestCell { cell: [column, row], margin: scratch.ratios.row(best[1])[best[0]] - rival }
+        BestCell { cell: [column, row], margin: log_ratios.row(best[1])[best[0]] - rival }
     }
 
-    /// What the scene itself had at the places of a coarse picture with these sides, given how it
-    /// has turned by now, and where the target was `seen` in the picture that was taken of it;
-    /// `None` if nothing is known of it.
-    pub(crate) fn empty_scene<'a>(
-        &self,
-        picture: [usize; 2],
-        turned: [f64; 2],
-        seen: ImagePoint,
-        memory: &'a SearchMemory,
-    ) -> Option<EmptyScene<'a>> {
-        let background = memory.background.as_ref()?;
-        let shift = [0, 1].map(|i| turned[i] - background.turned[i]);
+    /// Columns and rows of the cells in which a target is, or hides what is there, that is `seen`.
+    pub(crate) fn cells_hidden_by(&self, seen: ImagePoint) -> [Range<usize>; 2] {
         let seen = [seen.x, seen.y];
-        let hidden =
-            [0, 1].map(|i| self.hidden(picture[i], self.sides[i] as f64, shift[i], seen[i]));
-        let by = shift.map(|shift| (shift / self.coarseness as f64).round() as isize);
-        Some(EmptyScene { ratios: &background.ratios, by, hidden })
-    }
-
-    /// The columns (or rows) of `count` that a target hides which is `seen` there and reaches as
-    /// far as `reach`, px, when they have moved by `shift`, px.
-    fn hidden(&self, count: usize, reach: f64, shift: f64, seen: f64) -> Range<usize> {
-        let off = |index: usize| self.middle(index) + shift - seen;
-        let first = (0..count).find(|index| off(*index) >= -reach).unwrap_or(count);
-        let end = (first..count).find(|index| off(*index) > reach);
-        first..end.unwrap_or(count)
+        [0, 1].map(|i| {
+            let Range { start, end } = self.ranges[i].clone();
+            let off = |index: &usize| self.middle(*index) - seen[i];
+            let reach = self.sides[i] as f64;
+            let first = (start..end).find(|index| off(index) >= -reach).unwrap_or(end);
+            first..(first..end).find(|index| off(index) > reach).unwrap_or(end)
+        })
     }
 
     /// The middle of a cell of the coarse picture, px of the full picture.
@@ -225,55 +174,5 @@ impl SearchArea {
     pub(crate) fn middle(&self, index: usize) -> f64 {
         let side = self.coarseness as f64;
         index as f64 * side + (side - 1.0) / 2.0
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::search_memory::Background;
-
-    #[test]
-    fn the_empty_scene_is_subtracted_where_it_has_moved_to_and_not_where_the_target_hid_it() {
-        let scene = Plane::from_fn(7, 5, |x, y| (x + 10 * y) as f32 - 12.0);
-        let hidden = [2..4, 1..3];
-        let empty = EmptyScene { ratios: &scene, by: [2, -1], hidden };
-        let mut ratios = Plane::from_fn(7, 5, |_, _| 100.0);
-        empty.subtract_from(&mut ratios);
-        for (row, column) in (0..5).flat_map(|row| (0..7).map(move |column| (row, column))) {
-            let left = 100.0 - empty.at([column, row]);
-            assert_eq!(ratios.row(row)[column], left, "column {column}, row {row}");
-        }
-        // Cell (1, 3) was cell (3, 2) then: 3 + 20 - 12.
-        assert_eq!(empty.at([1, 3]), 11.0);
-        assert_eq!(empty.at([2, 2]), 0.0, "the target hid it");
-        assert_eq!(empty.at([6, 0]), 0.0, "unlike the target: 6 - 12");
-    }
-
-    /// A cell is where the scene had its middle then, by the turns of the scene.
-    #[test]
-    fn the_empty_scene_moves_as_the_camera_turns_and_hides_what_the_target_hid() {
-        let area = SearchArea {
-            ranges: [0..20, 0..15],
-            predicted: [20.0, 15.0],
-            half: [20.0, 15.0],
-            sides: [5, 3],
-            coarseness: 2,
-        };
-        let ratios = Plane::from_fn(20, 15, |x, y| 1.0 + (x + 100 * y) as f32);
-        let background = Background { coarseness: 2, ratios, turned: [1.0, 2.0] };
-        let mut memory = SearchMemory::default();
-        memory.background = Some(background);
-        let seen = ImagePoint { x: 16.0, y: 14.0 };
-        let (turned, sides) = ([7.3, -1.6], [20, 15]);
-        let empty = area.empty_scene(sides, turned, seen, &memory).unwrap();
-        for (row, column) in (0..15).flat_map(|row| (0..20).map(move |column| (row, column))) {
-            let then = [area.middle(column) + 6.3, area.middle(row) - 3.6];
-            let hidden = (then[0] - seen.x).abs() <= 5.0 && (then[1] - seen.y).abs() <= 3.0;
-            let [x, y] = then.map(|then| ((then + 0.5) / 2.0 - 0.5).round());
-            let was = 1.0 + (x.clamp(0.0, 19.0) + 100.0 * y.clamp(0.0, 14.0)) as f32;
-            let expected = if hidden { 0.0 } else { was };
-            assert_eq!(empty.at([column, row]), expected, "column {column}, row {row}");
-        }
     }
 }

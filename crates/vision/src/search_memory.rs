@@ -8,10 +8,9 @@
 //! tenth more of small targets in noise was lost. One that has changed and hovers is then left to
 //! the detector.
 
-use crossfix_correlation::Plane;
-
 use crate::TrackerConfig;
 use crate::appearance::{Appearance, AppearanceScratch};
+use crate::empty_scene::Background;
 use crate::place_map::PlaceMap;
 use crate::state::TargetBelief;
 use crate::tracker_part::TrackerPart;
@@ -29,16 +28,6 @@ const LAST_ALONE_S: f64 = 1.0;
 /// search knows. With half of it the first appearance is expected at half the contrast, and a
 /// target as bright as at first is found later.
 const FIRST_CONTRAST: f64 = 1.0;
-
-/// What the scene itself looks like to a target's reference: the log ratios in a picture in which
-/// the target was elsewhere, made coarser by a whole number.
-#[derive(Clone, Debug)]
-pub(crate) struct Background {
-    pub(crate) coarseness: usize,
-    pub(crate) ratios: Plane,
-    /// `SceneMemory::turned` when it was made, px.
-    pub(crate) turned: [f64; 2],
-}
 
 /// Where a target may be, after the last image that was searched for it.
 #[derive(Clone, Debug)]
@@ -106,6 +95,9 @@ impl SearchMemory {
     /// has done meanwhile.
     pub(crate) fn forget_places(&mut self) {
         (self.background, self.map) = (None, None);
+        if let Some(other) = &mut self.other {
+            other.background = None;
+        }
     }
 
     /// Forgets the appearance that is not in use: the target has been seen for sure.

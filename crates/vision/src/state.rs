@@ -68,8 +68,8 @@ pub(crate) struct TargetBelief {
     pub(crate) is_new: bool,
     /// The mean of what is about it, as long as its first appearance is not clear of noise.
     pub(crate) surroundings: Option<Box<Surroundings>>,
-    /// Its place in the tracker's snapshot picture.
-    pub(crate) in_snapshot: Option<ImagePoint>,
+    /// Whether it was seen in the tracker's snapshot picture.
+    pub(crate) is_in_snapshot: bool,
 }
 
 impl TargetBelief {
@@ -108,7 +108,7 @@ impl TargetBelief {
             last_seen: centre,
             is_new: true,
             surroundings: None,
-            in_snapshot: None,
+            is_in_snapshot: false,
         }
     }
 

@@ -15,6 +15,7 @@ use crate::followed_target::LEAST_MOVE_PX;
 use crate::frame::{FrameInput, Measurement, OtherTarget, Others};
 use crate::scene::SceneMemory;
 use crate::scratch::Scratch;
+use crate::snapshot::BackgroundSnapshot;
 use crate::{
     ImagePoint, ImageTrackId, PixelBox, TargetFeatures, TrackerConfig, TrackerConfigError,
     TrackerPart,
@@ -78,18 +79,6 @@ pub struct ImageTrack {
 /// distinguished from its scene has by then gone further than its size, if it moves at all. Half of
 /// it is little more than a candidate needs to be shown.
 const STAYS_S: f64 = 1.5;
-
-/// Snapshot: a picture of a moment ago in which every target was seen. It shows what a lost target
-/// is not.
-#[derive(Debug)]
-struct BackgroundSnapshot {
-    picture: Plane,
-    time: Timestamp,
-}
-
-/// Age at which a snapshot is replaced, s. With half of it a picture is copied twice as often; with
-/// twice as much it shows clouds as they were up to a second ago.
-const SNAPSHOT_AGE_S: f64 = 0.5;
 
 /// Refused images in a row that must agree with each other before the tracker believes them and not
 /// the last accepted one. With one, as with half of it, two late images in a row take the time back
@@ -201,7 +190,7 @@ impl ImageTracker {
         for followed in &mut self.followed {
             if let Follower::Posterior(target) = &mut followed.target {
                 target.search_memory.forget_places();
-                target.state.in_snapshot = None;
+                target.state.is_in_snapshot = false;
             }
         }
     }
@@ -299,7 +288,7 @@ impl ImageTracker {
         let frame = FrameInput {
             image,
             interval,
-            snapshot: self.snapshot.as_ref().map(|snapshot| &snapshot.picture),
+            snapshot: self.snapshot.as_ref(),
             scene: &self.scene,
             scene_moved,
             may_search: false,
@@ -380,24 +369,23 @@ impl ImageTracker {
             .followed
             .iter()
             .all(|followed| followed.is_candidate() || followed.target.is_seen());
-        let new = self
-            .followed
-            .iter()
-            .any(|f| matches!(&f.target, Follower::Posterior(t) if t.state.in_snapshot.is_none()));
-        let old =
-            self.snapshot.as_ref().is_none_or(|k| time.seconds_since(k.time) >= SNAPSHOT_AGE_S);
+        // What a candidate is on may be the scene.
+        let targets = || self.followed.iter().filter(|followed| !followed.is_candidate());
+        let new = targets()
+            .any(|followed| followed.target.belief().is_some_and(|belief| !belief.is_in_snapshot));
+        let old = self.snapshot.as_ref().is_none_or(|snapshot| snapshot.is_old(time));
         let posterior = self.config.algorithm == Algorithm::Posterior;
         if !posterior || self.followed.is_empty() || !all_seen || !(new || old) {
             return;
         }
-        let snapshot = self
-            .snapshot
-            .get_or_insert_with(|| BackgroundSnapshot { picture: Plane::default(), time });
-        snapshot.picture.copy_from(image);
-        snapshot.time = time;
+        let former = self.snapshot.take();
+        let seen = targets().filter_map(|followed| Some(followed.target.belief()?.last_seen));
+        let turned = self.scene.turned();
+        self.snapshot = Some(BackgroundSnapshot::of(image, turned, time, seen, former));
         for followed in &mut self.followed {
+            let is_in_it = !followed.is_candidate();
             if let Follower::Posterior(target) = &mut followed.target {
-                target.state.in_snapshot = Some(target.state.last_seen);
+                target.state.is_in_snapshot = is_in_it;
             }
         }
     }

@@ -194,7 +194,8 @@ fn what_a_camera_turns_over_is_no_swarm() {
         // turn, until the end of the scene. All that is turned over would be 5 per image.
         assert!(*elsewhere < 1.0, "{turn:?}: {outcomes:?}");
     }
-    // Of 48 other turns each hides its drone behind one spot or none; the mean is 0.93.
+    // Of 48 other turns each hides its drone behind one spot or none; their drones are covered in
+    // 0.93 of the images.
     let covered = outcomes.map(|(_, covered)| covered).iter().sum::<f64>() / outcomes.len() as f64;
     assert!(covered > 0.9, "{outcomes:?}");
 }
