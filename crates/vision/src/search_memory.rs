@@ -144,3 +144,30 @@ impl SearchMemory {
         other.is_last = !other.is_last;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use crossfix_correlation::Plane;
+
+    use super::*;
+    use crate::scratch::Scratch;
+    use crate::search_area::SearchArea;
+    use crate::{ImagePoint, PixelBox};
+
+    #[test]
+    fn after_a_gap_nothing_is_known_of_the_scene_by_either_appearance() {
+        let image =
+            Plane::from_fn(60, 40, |x, y| if x.abs_diff(30) < 4 { 200.0 } else { y as f32 });
+        let place = PixelBox::about(ImagePoint { x: 30.0, y: 20.0 }, 8.0, 8.0);
+        let (mut scratch, config) = (Scratch::default(), TrackerConfig::default());
+        let mut state = TargetBelief::new(&image, place, &mut scratch, &config);
+        state.unseen_s = 2.0 * LAST_ALONE_S;
+        let area = SearchArea::with_sides([60, 40], [8, 8], 1);
+        let background = || Some(Background::new(&image, &area, &[], [0.0; 2]));
+        let mut memory = SearchMemory { background: background(), ..SearchMemory::default() };
+        memory.take_first(&mut state, &config, &mut scratch.buffers);
+        memory.other.as_mut().unwrap().background = background();
+        memory.forget_places();
+        assert!(memory.background.is_none() && memory.other.unwrap().background.is_none());
+    }
+}
