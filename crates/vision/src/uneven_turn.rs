@@ -13,8 +13,8 @@ const UNEVEN_TURN: f64 = 0.2;
 /// than 40 px.
 const MOST_UNEVEN_PX: f64 = 16.0;
 
-/// How far from where a turn puts it a place is looked for, px along each axis. After a turn by more
-/// than 80 px it may be farther.
+/// How far from where a turn puts it a place is looked for, px along each axis. After a turn by
+/// more than 80 px it may be farther.
 pub(crate) fn reach_px(turn: [f64; 2]) -> f64 {
     (UNEVEN_TURN * turn[0].hypot(turn[1])).min(MOST_UNEVEN_PX)
 }
