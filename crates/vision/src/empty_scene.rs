@@ -122,7 +122,7 @@ fn take_greatest(values: &[f32], to: &mut [f32]) {
 }
 
 impl EmptyScene<'_> {
-    /// The scene's own ratio in a cell; 0 where it is unlike the target, and where the target was.
+    /// The scene's own ratio in a cell; 0 where it is unlike the target, and where targets were.
     /// What the picture did not show has what its nearest border had: taken as 0, what comes into
     /// the image is sooner found for the target (a drone before a camera that turns over spots was
     /// covered in 68 % of the images instead of 86).
