@@ -348,9 +348,14 @@ impl Site {
 
     /// Waits until a log of the site says something.
     pub fn wait_for_line(&self, log: &str, words: &str, patience: Duration) -> bool {
+        self.wait_for_lines(log, words, 1, patience)
+    }
+
+    /// Waits until words were logged so many times.
+    pub fn wait_for_lines(&self, log: &str, words: &str, times: usize, patience: Duration) -> bool {
         let deadline = Instant::now() + patience;
         while Instant::now() < deadline {
-            if self.text(log).contains(words) {
+            if self.text(log).matches(words).count() >= times {
                 return true;
             }
             std::thread::sleep(Duration::from_millis(20));
