@@ -10,6 +10,7 @@ use crossfix_correlation::{Plane, Resampler, View};
 use crate::ImagePoint;
 use crate::crop::replace_invalid;
 use crate::scene::ScenePicture;
+use crate::scene_turn::SceneTurn;
 
 /// Standard deviation of the change in contrast of an unchanged scene, in contrasts of the
 /// reference: from registration and compression. With half of it textured scenes count as targets,
@@ -90,6 +91,8 @@ pub(crate) struct ComparisonBuffers {
 pub(crate) struct PlaceThen<'a> {
     pub(crate) picture: &'a ScenePicture,
     pub(crate) place: ImagePoint,
+    /// Where what is in the image now was in that picture.
+    pub(crate) turn: SceneTurn,
     /// How far from there it may have been, px per axis.
     pub(crate) reach_px: f64,
     /// Where the target was seen in that picture.
@@ -227,7 +230,7 @@ impl ComparisonBuffers {
         placed: PlacedReference<'_>,
         resampler: &mut Resampler,
     ) -> Option<ArrivalEvidence> {
-        let PlaceThen { picture, place: then, seen, .. } = then;
+        let PlaceThen { picture, place: then, turn, seen, .. } = then;
         let PlacedReference { reference, energy, noise, .. } = placed;
         if !picture.holds(then) {
             return None;
@@ -236,7 +239,7 @@ impl ComparisonBuffers {
         self.before.reshape(width, height);
         resampler.resample(
             picture.image(),
-            View { x: then.x, y: then.y, scale: 1.0, turn_rad: 0.0 },
+            View { x: then.x, y: then.y, scale: turn.scale(), turn_rad: turn.roll_rad() },
             &mut self.before,
         );
         let mut sums = PixelSums::default();

@@ -5,6 +5,7 @@
 use crossfix_correlation::Plane;
 
 use crate::ImagePoint;
+use crate::scene_turn::SceneTurn;
 use crate::search_area::SearchArea;
 use crate::uneven_turn;
 
@@ -16,8 +17,13 @@ pub(crate) struct Background {
     /// The log likelihood ratios of the picture, made coarser, where they are above 0; 0 where
     /// targets were, whose own they are.
     ratios: Plane,
-    /// `SceneMemory::turned` when the picture was taken, px.
-    turned: [f64; 2],
+    /// `SceneMemory::turned` when the picture was taken.
+    turned: SceneTurn,
+}
+
+/// The middle of a column or row of cells of `side` px, px of the image.
+fn middle_of(cell: f64, side: usize) -> f64 {
+    cell * side as f64 + (side as f64 - 1.0) / 2.0
 }
 
 /// Memory for the [`EmptyScene`], which all targets share.
@@ -31,18 +37,19 @@ pub(crate) struct EmptySceneBuffers {
 pub(crate) struct EmptyScene<'a> {
     /// Log likelihood ratios in the picture that was taken of it.
     ratios: &'a Plane,
-    /// By how many cells it has moved since.
-    by: [isize; 2],
+    /// Where what is in the image now was in that picture.
+    turn: SceneTurn,
+    coarseness: usize,
 }
 
 impl Background {
     /// What the log likelihood ratios of a picture say of the scene, in which all targets were
-    /// `seen`; with `SceneMemory::turned` when it was taken, px.
+    /// `seen`; with `SceneMemory::turned` when it was taken.
     pub(crate) fn new(
         ratios: &Plane,
         area: &SearchArea,
         seen: &[ImagePoint],
-        turned: [f64; 2],
+        turned: SceneTurn,
     ) -> Self {
         let mut ratios = ratios.clone();
         ratios.samples_mut().iter_mut().for_each(|ratio| *ratio = ratio.max(0.0));
@@ -58,19 +65,20 @@ impl Background {
         self.coarseness
     }
 
-    /// What the scene has in an image, of which `SceneMemory::turned` is given, px: the greatest of
-    /// what it had within the reach of the turn since, to the nearest cell.
+    /// What the scene has in an image, of which `SceneMemory::turned` is given: the greatest of what
+    /// it had within the reach of the turn since, to the nearest cell.
     pub(crate) fn seen_at<'a>(
         &'a self,
-        turned: [f64; 2],
+        turned: SceneTurn,
         buffers: &'a mut EmptySceneBuffers,
     ) -> EmptyScene<'a> {
-        let shift = [0, 1].map(|i| turned[i] - self.turned[i]);
-        let cells = |px: f64| (px / self.coarseness as f64).round() as isize;
-        let (by, reach) = (shift.map(cells), cells(uneven_turn::reach_px(shift)));
-        let ratios =
-            if reach > 0 { buffers.widened(&self.ratios, reach as usize) } else { &self.ratios };
-        EmptyScene { ratios, by }
+        let turn = turned.and_then(self.turned.inverse());
+        let sides = [self.ratios.width(), self.ratios.height()].map(|side| side / 2);
+        let [x, y] = sides.map(|cell| middle_of(cell as f64, self.coarseness));
+        let reach_px = uneven_turn::reach_px(turn.moves(ImagePoint { x, y }));
+        let reach = (reach_px / self.coarseness as f64).round() as usize;
+        let ratios = if reach > 0 { buffers.widened(&self.ratios, reach) } else { &self.ratios };
+        EmptyScene { ratios, turn, coarseness: self.coarseness }
     }
 }
 
@@ -127,20 +135,31 @@ impl EmptyScene<'_> {
     /// the image is sooner found for the target (a drone before a camera that turns over spots was
     /// covered in 68 % of the images instead of 86).
     pub(crate) fn at(&self, [column, row]: [usize; 2]) -> f32 {
-        let [column, row] = [0, 1].map(|i| ([column, row][i] as isize).saturating_add(self.by[i]));
+        let [column, row] = self.then([column, row]).map(|at| at.round() as isize);
         self.ratios.clamped(column, row)
+    }
+
+    /// Where the middle of a cell was, in cells.
+    fn then(&self, cell: [usize; 2]) -> [f64; 2] {
+        let [x, y] = cell.map(|cell| middle_of(cell as f64, self.coarseness));
+        let then = self.turn.place(ImagePoint { x, y });
+        let first = middle_of(0.0, self.coarseness);
+        [then.x, then.y].map(|at| (at - first) / self.coarseness as f64)
     }
 
     /// Subtracts the scene's own ratios: the reference found this much of the target in the empty
     /// scene already.
     pub(crate) fn subtract_from(&self, ratios: &mut Plane) {
-        let last = [self.ratios.width(), self.ratios.height()].map(|side| side as isize - 1);
+        let last = [self.ratios.width(), self.ratios.height()].map(|side| side as f32 - 1.0);
         for y in 0..ratios.height() {
-            let row = (y as isize).saturating_add(self.by[1]).clamp(0, last[1]) as usize;
-            let scene = self.ratios.row(row);
-            for (x, ratio) in ratios.row_mut(y).iter_mut().enumerate() {
-                let column = (x as isize).saturating_add(self.by[0]).clamp(0, last[0]) as usize;
-                *ratio -= scene[column];
+            let ([first, next], row) = ([0, 1].map(|x| self.then([x, y])), ratios.row_mut(y));
+            let step = [0, 1].map(|i| (next[i] - first[i]) as f32);
+            // Half a cell is added, so that the conversion rounds.
+            let first = first.map(|at| at as f32 + 0.5);
+            for (x, ratio) in row.iter_mut().enumerate() {
+                let [column, row] =
+                    [0, 1].map(|i| (first[i] + x as f32 * step[i]).clamp(0.0, last[i]) as usize);
+                *ratio -= self.ratios.row(row)[column];
             }
         }
     }
@@ -158,7 +177,12 @@ mod tests {
     fn background() -> Background {
         let area = SearchArea::with_sides([20, 15], [5, 3], 2);
         let ratios = Plane::from_fn(20, 15, |x, y| (x + 100 * y) as f32 - 10.0);
-        Background::new(&ratios, &area, &[ImagePoint { x: 16.0, y: 14.0 }], [1.0, 2.0])
+        Background::new(
+            &ratios,
+            &area,
+            &[ImagePoint { x: 16.0, y: 14.0 }],
+            SceneTurn::shift([1.0, 2.0]),
+        )
     }
 
     fn then([x, y]: [isize; 2]) -> f32 {
@@ -170,7 +194,7 @@ mod tests {
     /// about the place nearest to it.
     fn assert_moved(turned: [f64; 2], by: [isize; 2], reach: isize) {
         let (background, mut buffers) = (background(), EmptySceneBuffers::default());
-        let empty = background.seen_at(turned, &mut buffers);
+        let empty = background.seen_at(SceneTurn::shift(turned), &mut buffers);
         let mut ratios = Plane::from_fn(20, 15, |_, _| 5000.0);
         empty.subtract_from(&mut ratios);
         for (row, column) in (0..15).flat_map(|row| (0..20).map(move |column| (row, column))) {
@@ -191,6 +215,23 @@ mod tests {
     fn the_scene_moves_as_the_camera_turns_and_what_the_target_hid_is_unknown() {
         assert_moved([1.0, 2.0], [0, 0], 0);
         assert_moved([3.1, -0.1], [1, -1], 0);
+    }
+
+    #[test]
+    fn a_cell_that_has_rolled_has_what_was_there() {
+        let (background, mut buffers) = (background(), EmptySceneBuffers::default());
+        // About the middle of the cell (10, 7): what is five cells to the right was three to the
+        // right and four down.
+        let about = ImagePoint { x: 20.5, y: 14.5 };
+        let turned = SceneTurn::about(about, [0.0; 2], 0.6 - 1.0, 0.8)
+            .and_then(SceneTurn::shift([1.0, 2.0]));
+        let empty = background.seen_at(turned, &mut buffers);
+        let mut ratios = Plane::from_fn(20, 15, |_, _| 5000.0);
+        empty.subtract_from(&mut ratios);
+        for ([x, y], was) in [([10, 7], [10, 7]), ([15, 7], [13, 11]), ([0, 12], [0, 2])] {
+            assert_eq!(empty.at([x, y]), then(was), "{x}, {y}");
+            assert_eq!(ratios.row(y)[x], 5000.0 - then(was), "{x}, {y}");
+        }
     }
 
     #[test]

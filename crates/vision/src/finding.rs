@@ -9,6 +9,7 @@ use crate::detector::{Detector, Found, KnownTarget};
 use crate::figure::meant;
 use crate::followed::{Followed, Follower, TakenUpBy, describe};
 use crate::frame::{FrameInput, Others, TargetStep};
+use crate::scene_turn::SceneTurn;
 use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
     TrackerPart,
@@ -232,7 +233,8 @@ impl ImageTracker {
                 && followed.target.is_seen()
             {
                 let gone = [at.x - first.x, at.y - first.y];
-                let in_scene = [gone[0] + turned[0] - then[0], gone[1] + turned[1] - then[1]];
+                let (now, first) = (turned.place(at), then.place(*first));
+                let in_scene = [now.x - first.x, now.y - first.y];
                 // What is on the lens keeps its place in the image, what belongs to the scene its
                 // place there: only the smaller of both distances shows a target.
                 *has_moved |= gone[0].hypot(gone[1]).min(in_scene[0].hypot(in_scene[1])) > side;
@@ -255,7 +257,7 @@ impl ImageTracker {
             velocity_sd: None,
         });
         let known: Vec<KnownTarget> = known.chain(given).collect();
-        let findings = detector.step(image, interval, turned, &known);
+        let findings = detector.step(image, interval, self.scene.shifted(), &known);
         self.followed.retain(|followed| !findings.scene.contains(&followed.id));
         self.tracks.retain(|track| !findings.scene.contains(&track.id));
         findings.found
@@ -275,7 +277,7 @@ impl ImageTracker {
             interval,
             snapshot: None,
             scene: &self.scene,
-            scene_moved: [0.0; 2],
+            scene_moved: SceneTurn::none(),
             may_search: false,
             others: Others::default(),
             config: &self.config,

@@ -8,6 +8,7 @@ use crate::config::Algorithm;
 use crate::followed_target::ImageTarget;
 use crate::frame::{FrameInput, TargetStep};
 use crate::paper::PaperTarget;
+use crate::scene_turn::SceneTurn;
 use crate::scratch::Scratch;
 use crate::state::TargetBelief;
 use crate::{
@@ -23,7 +24,7 @@ pub(crate) enum TakenUpBy {
     Detected {
         /// Where it was found, and how far the scene had moved then, px.
         first: ImagePoint,
-        turned: [f64; 2],
+        turned: SceneTurn,
         /// Whether it has been elsewhere since or before, both in the image and in the scene, so
         /// that the background of its place is known without it: what keeps to its place in the
         /// image is on the lens, or written into the video.

@@ -5,6 +5,7 @@ use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
 
 use crate::scene::SceneMemory;
+use crate::scene_turn::SceneTurn;
 use crate::snapshot::BackgroundSnapshot;
 use crate::{ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
@@ -18,9 +19,8 @@ pub(crate) struct FrameInput<'a> {
     pub(crate) snapshot: Option<&'a BackgroundSnapshot>,
     /// What the scene looked like lately.
     pub(crate) scene: &'a SceneMemory,
-    /// Shift of everything in the image since the scene was looked at last, as the camera turned,
-    /// px.
-    pub(crate) scene_moved: [f64; 2],
+    /// Where what was in the image before is now, as the camera has turned.
+    pub(crate) scene_moved: SceneTurn,
     /// Whether it is this target's turn to be searched for, if it is lost: one per frame, as a
     /// search costs as much as many targets that are followed.
     pub(crate) may_search: bool,

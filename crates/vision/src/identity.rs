@@ -7,6 +7,7 @@ use crate::fit::TargetFit;
 use crate::frame::FrameInput;
 use crate::motion::ImageMotion;
 use crate::scene::ScenePicture;
+use crate::scene_turn::SceneTurn;
 use crate::scratch::Scratch;
 use crate::state::TargetBelief;
 use crate::tracker_part::TrackerPart;
@@ -60,9 +61,8 @@ pub(crate) struct TargetIdentity {
     in_pictures: Vec<(u64, ImagePoint)>,
     /// Speed of the target when it was last seen for sure, px/s, ...
     speed_px_s: f64,
-    /// ... and its place in the scene then: the place in the image plus how far the camera had
-    /// turned, px.
-    last_in_scene: Option<[f64; 2]>,
+    /// ... and where what it was before was at the beginning.
+    last_in_scene: Option<ImagePoint>,
     /// What was known before it was found again, as long as the find is not sure.
     probation: Option<Probation>,
 }
@@ -109,11 +109,9 @@ impl TargetIdentity {
         if state.unseen_s > 0.0 || self.probation.is_some() {
             return;
         }
-        // `turned` is that of this image already; with `moved` it is that of the image before, in
-        // which `last_seen` is.
-        let (turned, moved) = (frame.scene.turned(), frame.scene_moved);
-        let ImagePoint { x, y } = state.last_seen;
-        self.last_in_scene = Some([x + turned[0] + moved[0], y + turned[1] + moved[1]]);
+        // `turned` is that of this image already, and `last_seen` is in the image before.
+        let now = frame.scene_moved.place(state.last_seen);
+        self.last_in_scene = Some(frame.scene.turned().place(now));
     }
 
     /// Notes its place when a picture of the scene was taken, if it was seen.
@@ -162,8 +160,8 @@ impl TargetIdentity {
         // It has moved on from a picture's time if its speed would have taken it farther than its
         // length since, and out of reach of that place.
         let speed = self.speed_px_s.max(self.least_speed(state, frame, place));
-        let mut against = |picture: &ScenePicture, then: ImagePoint| {
-            let seen = self.place_in(picture);
+        let mut against = |picture: &ScenePicture, turn: SceneTurn| {
+            let (seen, then) = (self.place_in(picture), turn.place(place));
             // After a turn by more than that reaches, what is found nowhere is taken to have come
             // all the same: a target over which a camera turns fast has no other evidence.
             let reach_px = uneven_turn::reach_px([then.x - place.x, then.y - place.y]);
@@ -173,15 +171,15 @@ impl TargetIdentity {
             if seen.is_none() && !(self.was_lost(state, picture) && has_moved_on) {
                 return None;
             }
-            let then = PlaceThen { picture, place: then, reach_px, seen };
+            let then = PlaceThen { picture, place: then, turn, reach_px, seen };
             comparison.with(then, placed, &mut buffers.resampler)
         };
         let pictures = || frame.scene.pictures();
-        let scene = pictures().find_map(|picture| against(picture, picture.then(place)));
+        let scene = pictures().find_map(|picture| against(picture, picture.turn()));
         // What is written into the video, or lies on the lens, turns with the camera.
-        let has_turned = |then: ImagePoint| (then.x - place.x).hypot(then.y - place.y) > longest;
-        let mut turned = pictures().filter(|picture| has_turned(picture.then(place)));
-        let lens = turned.find_map(|picture| against(picture, place));
+        let has_turned = |[right, down]: [f64; 2]| right.hypot(down) > longest;
+        let mut turned = pictures().filter(|picture| has_turned(picture.turn().moves(place)));
+        let lens = turned.find_map(|picture| against(picture, SceneTurn::none()));
         let scene = scene.map_or(0.0, |arrival| arrival.log_ratio(placed.usual));
         // The worse of both: it must have come into the scene and must not be on the lens.
         lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(placed.usual)))
@@ -200,11 +198,11 @@ impl TargetIdentity {
 
     /// Least speed with which a lost target can have come to a place by now, px/s.
     fn least_speed(&self, state: &TargetBelief, frame: FrameInput<'_>, place: ImagePoint) -> f64 {
-        let Some([x, y]) = self.last_in_scene else { return 0.0 };
-        let turned = frame.scene.turned();
+        let Some(last) = self.last_in_scene else { return 0.0 };
+        let now = frame.scene.turned().place(place);
         let lost_s = self.probation.as_ref().map_or(state.unseen_s, |probation| probation.unseen_s);
         // |place in the scene now - place in the scene when last seen| / time lost.
-        (place.x + turned[0] - x).hypot(place.y + turned[1] - y) / lost_s.max(frame.interval)
+        (now.x - last.x).hypot(now.y - last.y) / lost_s.max(frame.interval)
     }
 
     /// Updates the probability that what is followed is the target and neither the scene nor noise,

@@ -23,7 +23,6 @@
 
 use crossfix_correlation::Plane;
 
-use crate::TrackerConfig;
 use crate::coarse::{CoarseReference, PictureLikeness, coarsened};
 use crate::crop::{crop, replace_invalid};
 use crate::empty_scene::Background;
@@ -37,6 +36,7 @@ use crate::search_area::{BestCell, SearchArea};
 use crate::search_memory::{SearchMap, SearchMemory};
 use crate::state::TargetBelief;
 use crate::tracker_part::TrackerPart;
+use crate::{ImagePoint, TrackerConfig};
 
 /// Probability in one place from which on the map has found the target. With 0.9 one drawn sequence
 /// in forty is lost for good, as something else is found and followed; with 0.999 an eighth more of
@@ -256,8 +256,10 @@ impl Sought<'_> {
             self.memory.map.take().filter(|known| known.places.fits(area.coarseness, sides));
         let mut map = known.unwrap_or_else(|| self.first_map(frame, area, sides));
         let elapsed = (state.unseen_s - map.unseen_s).max(0.0);
-        // The same thing has moved in the image by what the scene had turned before, less now.
-        let moved = [0, 1].map(|i| map.turned[i] - turned[i]);
+        // All of the map moves as its likeliest place does.
+        let likeliest = map.places.likeliest(area.near());
+        let [x, y] = area.place_of([likeliest.column, likeliest.row]);
+        let moved = map.turned.and_then(turned.inverse()).moves(ImagePoint { x, y });
         map.places.predict(elapsed, map.speed * elapsed, moved, &mut scratch.search.spread);
         (map.unseen_s, map.turned) = (state.unseen_s, turned);
         &mut self.memory.map.insert(map).places

@@ -12,6 +12,7 @@ use crate::TrackerConfig;
 use crate::appearance::{Appearance, AppearanceScratch};
 use crate::empty_scene::Background;
 use crate::place_map::PlaceMap;
+use crate::scene_turn::SceneTurn;
 use crate::state::TargetBelief;
 use crate::tracker_part::TrackerPart;
 
@@ -33,9 +34,9 @@ const FIRST_CONTRAST: f64 = 1.0;
 #[derive(Clone, Debug)]
 pub(crate) struct SearchMap {
     pub(crate) places: PlaceMap,
-    /// For how long the target had not been seen then, s, and `SceneMemory::turned` then, px.
+    /// For how long the target had not been seen then, s, and `SceneMemory::turned` then.
     pub(crate) unseen_s: f64,
-    pub(crate) turned: [f64; 2],
+    pub(crate) turned: SceneTurn,
     /// How fast the target was when it was lost, px/s.
     pub(crate) speed: f64,
 }
@@ -163,7 +164,7 @@ mod tests {
         let mut state = TargetBelief::new(&image, place, &mut scratch, &config);
         state.unseen_s = 2.0 * LAST_ALONE_S;
         let area = SearchArea::with_sides([60, 40], [8, 8], 1);
-        let background = || Some(Background::new(&image, &area, &[], [0.0; 2]));
+        let background = || Some(Background::new(&image, &area, &[], SceneTurn::none()));
         let mut memory = SearchMemory { background: background(), ..SearchMemory::default() };
         memory.take_first(&mut state, &config, &mut scratch.buffers);
         memory.other.as_mut().unwrap().background = background();

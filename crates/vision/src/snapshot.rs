@@ -5,6 +5,7 @@ use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
 
 use crate::ImagePoint;
+use crate::scene_turn::SceneTurn;
 
 /// Age at which a snapshot is replaced, s. With half of it a picture is copied twice as often; with
 /// twice as much it shows clouds as they were up to a second ago.
@@ -14,8 +15,8 @@ const SNAPSHOT_AGE_S: f64 = 0.5;
 #[derive(Debug)]
 pub(crate) struct BackgroundSnapshot {
     pub(crate) picture: Plane,
-    /// [`SceneMemory::turned`](crate::scene::SceneMemory::turned) then, px.
-    pub(crate) turned: [f64; 2],
+    /// [`SceneMemory::turned`](crate::scene::SceneMemory::turned) then.
+    pub(crate) turned: SceneTurn,
     /// Where the targets were seen in it.
     pub(crate) seen: Vec<ImagePoint>,
     time: Timestamp,
@@ -26,7 +27,7 @@ impl BackgroundSnapshot {
     /// memory of a former one is used again.
     pub(crate) fn of(
         image: &Plane,
-        turned: [f64; 2],
+        turned: SceneTurn,
         time: Timestamp,
         seen: impl Iterator<Item = ImagePoint>,
         former: Option<Self>,

@@ -14,6 +14,7 @@ use crate::followed::{Followed, Follower, TakenUpBy, describe};
 use crate::followed_target::LEAST_MOVE_PX;
 use crate::frame::{FrameInput, Measurement, OtherTarget, Others};
 use crate::scene::SceneMemory;
+use crate::scene_turn::SceneTurn;
 use crate::scratch::Scratch;
 use crate::snapshot::BackgroundSnapshot;
 use crate::{
@@ -231,15 +232,14 @@ impl ImageTracker {
         since.map_or(LONGEST_INTERVAL, |since| since.clamp(SHORTEST_INTERVAL, LONGEST_INTERVAL))
     }
 
-    /// Registers an image with the scene, and returns by how much everything has moved in it, px.
-    fn register(&mut self, image: &Plane, interval: f64) -> [f64; 2] {
+    /// Registers an image with the scene, and returns where what was in the image before is now.
+    fn register(&mut self, image: &Plane, interval: f64) -> SceneTurn {
         let before = self.scene.turned();
         if self.config.algorithm == Algorithm::Posterior {
             self.scene.register(image, interval);
         }
         let after = self.scene.turned();
-        // What is at p now was at p + turned at first: the same thing has moved by before - after.
-        [0, 1].map(|i| before[i] - after[i])
+        before.and_then(after.inverse())
     }
 
     /// The lost target whose turn it is to be searched for.
@@ -267,21 +267,24 @@ impl ImageTracker {
     }
 
     /// Notes where each target is expected in the next image, for the others.
-    fn note_places(&mut self, interval: f64, scene_moved: [f64; 2]) {
+    fn note_places(&mut self, interval: f64, scene_moved: SceneTurn) {
         // Where the camera has been jerked nobody knows yet whether the targets have moved with it.
-        let is_jerked = scene_moved[0].hypot(scene_moved[1]) >= LEAST_MOVE_PX;
+        let is_jerked = |place: &PixelBox| {
+            let [right, down] = scene_moved.moves(place.centre());
+            right.hypot(down) >= LEAST_MOVE_PX
+        };
         self.places.clear();
         self.places.extend(self.followed.iter().map(|followed| OtherTarget {
             id: followed.id,
             since: followed.since,
             measured_at: followed.measured_at,
             began_on: followed.began_on,
-            place: followed.expected(interval).filter(|_| !is_jerked),
+            place: followed.expected(interval).filter(|place| !is_jerked(place)),
         }));
     }
 
     /// Follows all targets into an image, and makes its tracks.
-    fn follow(&mut self, image: &Plane, time: Timestamp, interval: f64, scene_moved: [f64; 2]) {
+    fn follow(&mut self, image: &Plane, time: Timestamp, interval: f64, scene_moved: SceneTurn) {
         self.part_those_apart();
         self.note_places(interval, scene_moved);
         let turn = self.next_sought();

@@ -149,6 +149,8 @@ pub(super) struct Candidate {
     pub(super) gone_px: f64,
     /// ... and in the image.
     pub(super) gone_in_image_px: f64,
+    /// How far the scene has turned fast since then, px.
+    pub(super) turned_fast_px: f64,
 }
 
 impl Candidate {
@@ -167,6 +169,7 @@ impl Candidate {
             first_in_image: plot.place,
             gone_px: 0.0,
             gone_in_image_px: 0.0,
+            turned_fast_px: 0.0,
         }
     }
 
@@ -231,8 +234,8 @@ impl Candidate {
         let off = [0, 1].map(|i| self.axes[i].position() - self.first[i]);
         self.gone_px = self.gone_px.max(off[0].hypot(off[1]));
         let ImagePoint { x, y } = self.first_in_image;
-        self.gone_in_image_px =
-            self.gone_in_image_px.max((plot.place.x - x).hypot(plot.place.y - y));
+        let in_image = [plot.place.x - x, plot.place.y - y];
+        self.gone_in_image_px = self.gone_in_image_px.max(in_image[0].hypot(in_image[1]));
         // ln (P_D N(innovation; 0, S) / clutter), with P_D the probability of a plot.
         let PlotInnovation { squared, determinant } = innovation;
         let there = -0.5 * squared - (std::f64::consts::TAU * determinant.sqrt()).ln();
@@ -327,11 +330,13 @@ impl Candidates {
 
     /// Associates the plots of the next image: each candidate takes the nearest free plot in its
     /// gate, and the plots that are left begin candidates and count as clutter. `turned` is by how
-    /// much the scene has moved since the first image, px.
+    /// much the scene has moved since the first image, px, and `turned_fast_px` how far it has
+    /// turned since the image before if it turns fast.
     pub(super) fn step(
         &mut self,
         plots: &[Plot],
         turned: [f64; 2],
+        turned_fast_px: f64,
         interval: f64,
         sides: [usize; 2],
     ) {
@@ -342,6 +347,7 @@ impl Candidates {
         // The likeliest candidates choose first: the list is sorted.
         for candidate in &mut self.list {
             candidate.axes.iter_mut().for_each(|axis| axis.time_update(interval));
+            candidate.turned_fast_px += turned_fast_px;
             let near = plots
                 .iter()
                 .enumerate()
@@ -389,6 +395,7 @@ impl Candidates {
             candidate.first = [0, 1].map(|i| candidate.axes[i].position());
             candidate.first_in_image = candidate.plot.place;
             (candidate.gone_px, candidate.gone_in_image_px) = (0.0, 0.0);
+            candidate.turned_fast_px = 0.0;
         }
     }
 

@@ -71,7 +71,9 @@ impl CommonMotion {
     /// The motion that most of what moves has in common, in an image of `sides`; `None` if there is
     /// none.
     pub(super) fn of(all: impl Iterator<Item = MovingThing>, sides: [usize; 2]) -> Option<Self> {
-        let moving: Vec<MovingThing> = all.filter(MovingThing::is_moving).collect();
+        // What was found in this image has moved, but nobody knows yet how.
+        let (found_now, others): (Vec<_>, Vec<_>) = all.partition(|thing| thing.sd.is_infinite());
+        let moving: Vec<MovingThing> = others.into_iter().filter(MovingThing::is_moving).collect();
         if moving.len() < LEAST_THINGS {
             return None;
         }
@@ -82,8 +84,8 @@ impl CommonMotion {
         let common = Self(mean(moving.iter().filter(|one| first.is_like(one)))?);
         let places: Vec<ImagePoint> =
             moving.iter().filter(|one| common.holds(one)).map(|one| one.place).collect();
-        let is_most =
-            places.len() >= LEAST_THINGS && places.len() as f64 > LEAST_SHARE * moving.len() as f64;
+        let is_most = places.len() >= LEAST_THINGS
+            && places.len() as f64 > LEAST_SHARE * (moving.len() + found_now.len()) as f64;
         (is_most && lie_across(&places, sides)).then_some(common)
     }
 

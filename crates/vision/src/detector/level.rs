@@ -60,6 +60,13 @@ const CONTRASTS: [f32; 2] = [0.5, 2.0];
 /// changes are found; with twice as much a target that a turning camera keeps nearly in its place
 /// is refused.
 const LENS: f32 = 0.35;
+/// What keeps its place in the image is a mean over this way of the scene, px, about as long as its
+/// texture: the scene averages out of it. With four times as much what passes behind a reticle is
+/// found.
+const LENS_PX: f64 = 10.0;
+/// ... and over this time at least, s. With half of it a target that a camera follows is on the lens
+/// before it is found.
+const LENS_S: f64 = 0.25;
 
 /// Time and camera direction of an image, for the background.
 #[derive(Clone, Copy, Debug)]
@@ -67,6 +74,8 @@ pub(super) struct Moment {
     /// By how much the scene has moved since the first image, px: what is at (x, y) was at (x, y)
     /// plus this.
     pub(super) turned: [f64; 2],
+    /// How fast it turns, in the mean, px/s.
+    pub(super) turning_px_s: f64,
     /// Time since the image before, s.
     pub(super) interval: f64,
     /// Weight of this image in the background.
@@ -127,6 +136,7 @@ pub(super) struct Level {
     /// Correlation of an image's changes with the next one's, 0 to 1: 0 for a sensor's noise, 0.9
     /// for compressed video.
     pub(super) persistence: f32,
+    is_textured: bool,
     /// Whether too many cells have changed, or the scene sways too far, for it to be that of the
     /// background.
     is_lost: bool,
@@ -152,6 +162,7 @@ impl Level {
             contrast: 1.0,
             spread: LEAST_SPREAD,
             sway: (FIRST_SWAY_PX / cell as f32).powi(2),
+            is_textured: false,
             persistence: 0.0,
             is_lost: false,
             samples: [Vec::new(), Vec::new()],
@@ -162,6 +173,11 @@ impl Level {
     /// Side of a cell, px.
     pub(super) fn cell(&self) -> usize {
         self.cell
+    }
+
+    /// Whether enough of the scene has texture to show its sway.
+    pub(super) fn is_textured(&self) -> bool {
+        self.is_textured
     }
 
     /// Sway of what has texture, px (root mean square).
@@ -208,8 +224,10 @@ impl Level {
         let now = self.now.row(y)[x];
         // The background's cell (x, y) lies at (x, y) - rest in the image's cells.
         let at = [x as f32 - self.rest[0], y as f32 - self.rest[1]].map(f64::from);
-        let of_lens = (now - between(&self.on_lens, at)).abs();
-        of_lens < LENS * (now - self.contrast * self.mean.row(y)[x]).abs()
+        let of_lens = between(&self.on_lens, at);
+        let excess = now - self.contrast * self.mean.row(y)[x];
+        // It hides the scene, or is in the surroundings of what stands out beside it.
+        (now - of_lens).abs().min((excess - of_lens).abs()) < LENS * excess.abs()
     }
 
     /// Least strength of something that is not noise, in spreads.
@@ -256,7 +274,10 @@ impl Level {
     /// Takes the image into the mean of what keeps its place in it, except where `known` covers it:
     /// in the background's cells, which lie within a cell of the image's. Known targets are painted
     /// over, so that their edges are as empty as they.
-    fn learn_lens(&mut self, Moment { share, is_first, .. }: Moment, known: &[Cells]) {
+    fn learn_lens(&mut self, moment: Moment, known: &[Cells]) {
+        let Moment { share, is_first, turning_px_s, interval, .. } = moment;
+        let passed = (turning_px_s * interval / LENS_PX).min(interval / LENS_S);
+        let share = share.max(1.0 - (-passed).exp() as f32);
         if is_first {
             self.on_lens.copy_from(&self.stands_out);
         }
@@ -353,8 +374,8 @@ impl Level {
             }
         }
         // A scene without texture shows neither its sway nor whether it is another one.
-        let is_textured = textured >= LEAST_TEXTURED;
-        let sway = if is_textured {
+        self.is_textured = textured >= LEAST_TEXTURED;
+        let sway = if self.is_textured {
             (changes / slopes).clamp(least, most)
         } else {
             (FIRST_SWAY_PX / self.cell as f32).powi(2)
@@ -364,7 +385,7 @@ impl Level {
         self.sway = sway.max(self.sway + share * (sway - self.sway));
         let sways_too_far = self.sway_px() >= 0.99 * f64::from(SWAY_PX[1]);
         self.is_lost =
-            is_textured && (sways_too_far || changed as f32 > MOST_CHANGED * textured as f32);
+            self.is_textured && (sways_too_far || changed as f32 > MOST_CHANGED * textured as f32);
     }
 
     /// Converts the changes to standard deviations, and learns the background.
@@ -465,7 +486,9 @@ mod tests {
             // Sky above: there nothing sways.
             if down < 72.0 { 0.0 } else { waves as f32 }
         });
-        level.see(Moment { turned, interval: 1.0 / 30.0, share: 0.1, is_first }, &[]);
+        let moment =
+            Moment { turned, turning_px_s: 0.0, interval: 1.0 / 30.0, share: 0.1, is_first };
+        level.see(moment, &[]);
     }
 
     fn greatest_change(level: &Level) -> f32 {

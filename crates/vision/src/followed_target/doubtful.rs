@@ -22,7 +22,7 @@ impl ImageTarget {
     /// the target too. But light that changes may be taken for a turn, so the target may have
     /// stayed as well.
     pub(super) fn may_move_with_scene(&mut self, frame: FrameInput<'_>) {
-        let by = frame.scene_moved;
+        let by = frame.scene_moved.moves(self.state.position());
         let is_followed = !self.state.is_searching() && !self.identity.is_on_probation();
         if is_followed
             && by[0].hypot(by[1]) >= LEAST_MOVE_PX

@@ -42,6 +42,29 @@ impl Scene {
         self.image_with(target, turned, |_, _| 0.0)
     }
 
+    /// The image of a camera that rolls, with the target at a place of the image and something that
+    /// looks just like it at a place of the scene; and where that is in the image.
+    pub fn image_rolled(
+        &mut self,
+        target: Option<[f32; 2]>,
+        roll_rad: f32,
+        alike: [f32; 2],
+    ) -> (Plane, [f32; 2]) {
+        let straight = self.image_with(None, [0.0; 2], |_, _| 0.0);
+        let at = rolled(alike, -roll_rad);
+        let blob = |place: [f32; 2], [x, y]: [f32; 2]| {
+            let (u, v) = ((x - place[0]) / 4.0, (y - place[1]) / 2.4);
+            self.contrast * (-0.5 * (u * u + v * v).powi(2)).exp()
+        };
+        let image = Plane::from_fn(WIDTH, HEIGHT, |column, row| {
+            let here = [column as f32, row as f32];
+            let [x, y] = rolled(here, roll_rad);
+            let scene = straight.clamped(x.round() as isize, y.round() as isize);
+            scene + blob(at, here) + target.map_or(0.0, |target| blob(target, here))
+        });
+        (image, at)
+    }
+
     /// The same, and what is added to it by a function of column and row of the image.
     pub fn image_with(
         &mut self,
@@ -64,6 +87,13 @@ impl Scene {
             128.0 + per_wave * cloud + body + more(column as f32, row as f32) + noise * normal
         })
     }
+}
+
+/// Where what is at a place of the image of a camera that rolls by an angle is in the scene.
+fn rolled([x, y]: [f32; 2], roll_rad: f32) -> [f32; 2] {
+    let middle = [WIDTH as f32 / 2.0, HEIGHT as f32 / 2.0];
+    let ([right, down], (sin, cos)) = ([x - middle[0], y - middle[1]], roll_rad.sin_cos());
+    [middle[0] + cos * right - sin * down, middle[1] + sin * right + cos * down]
 }
 
 pub fn tracker_on([x, y]: [f32; 2]) -> ImageTracker {
