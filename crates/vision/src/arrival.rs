@@ -44,6 +44,10 @@ const MOST: f64 = 8.0;
 /// at all whatever is there counts as having come with every step of the light, where there is no
 /// noise to hide the difference. With half of its width so it does with a step by two.
 const LIGHTER: [f64; 2] = [0.5, 2.0];
+/// Where roll and zoom move the reference's edges by less than this, px, they are left out: what is
+/// sampled straight is sharper. With half of it small turns blur a picture, and what is the same
+/// counts as having changed a little.
+const STRAIGHT_PX: f64 = 0.2;
 /// Least share of the reference's energy that must lie where the target was not before. With half
 /// of it contrasts are measured by an eighth of the energy, with eight times the whole's noise
 /// variance; with twice as much a slow target's pictures show nothing for longer.
@@ -237,11 +241,11 @@ impl ComparisonBuffers {
         }
         let (width, height) = (reference.width(), reference.height());
         self.before.reshape(width, height);
-        resampler.resample(
-            picture.image(),
-            View { x: then.x, y: then.y, scale: turn.scale(), turn_rad: turn.roll_rad() },
-            &mut self.before,
-        );
+        let is_straight = turn.bend() * width.max(height) as f64 / 2.0 < STRAIGHT_PX;
+        let (scale, turn_rad) =
+            if is_straight { (1.0, 0.0) } else { (turn.scale(), turn.roll_rad()) };
+        let view = View { x: then.x, y: then.y, scale, turn_rad };
+        resampler.resample(picture.image(), view, &mut self.before);
         let mut sums = PixelSums::default();
         for y in 0..height {
             let row_covered = seen.is_some_and(|seen| covered(y, height, then.y, seen.y));

@@ -62,6 +62,12 @@ impl SceneTurn {
         Self(self.0.inverse())
     }
 
+    /// How far roll and zoom move what is a px from where they move nothing, px.
+    pub(crate) fn bend(self) -> f64 {
+        let (sin, cos) = self.roll_rad().sin_cos();
+        (self.scale() * cos - 1.0).hypot(self.scale() * sin)
+    }
+
     /// Size there over size here.
     pub(crate) fn scale(self) -> f64 {
         self.0.scaling()
@@ -90,6 +96,7 @@ mod tests {
         assert_eq!(turn.moves(about).map(|by| (by * 1e9).round() / 1e9), [3.0, -2.0]);
         assert!((turn.scale() - 1.1_f64.hypot(0.2)).abs() < 1e-12);
         assert!((turn.roll_rad() - 0.2_f64.atan2(1.1)).abs() < 1e-12);
+        assert!((turn.bend() - 0.1_f64.hypot(0.2)).abs() < 1e-12);
     }
 
     #[test]
