@@ -241,14 +241,18 @@ impl ComparisonBuffers {
         }
         let (width, height) = (reference.width(), reference.height());
         self.before.reshape(width, height);
-        let is_straight = turn.bend() * width.max(height) as f64 / 2.0 < STRAIGHT_PX;
+        let bent_px = turn.bend() * width.max(height) as f64 / 2.0;
+        // A pixel, and what roll and zoom move the edges by.
+        let margin_px = 1.0 + bent_px;
+        let is_straight = bent_px < STRAIGHT_PX;
         let (scale, turn_rad) =
             if is_straight { (1.0, 0.0) } else { (turn.scale(), turn.roll_rad()) };
         let view = View { x: then.x, y: then.y, scale, turn_rad };
         resampler.resample(picture.image(), view, &mut self.before);
         let mut sums = PixelSums::default();
         for y in 0..height {
-            let row_covered = seen.is_some_and(|seen| covered(y, height, then.y, seen.y));
+            let row_covered =
+                seen.is_some_and(|seen| covered(y, height, then.y, seen.y, margin_px));
             let above = self.before.row(y.saturating_sub(1));
             let rows =
                 reference.row(y).iter().zip(self.now.row(y)).zip(self.before.row(y)).zip(above);
@@ -257,7 +261,9 @@ impl ComparisonBuffers {
                 // Squared slope, by the differences from the left and the upper neighbour.
                 let slope = (before - left).powi(2) + (before - above).powi(2);
                 left = *before;
-                if !(row_covered && seen.is_some_and(|seen| covered(x, width, then.x, seen.x))) {
+                if !(row_covered
+                    && seen.is_some_and(|seen| covered(x, width, then.x, seen.x, margin_px)))
+                {
                     sums.add(*reference, *now, *before, slope);
                 }
             }
@@ -267,9 +273,9 @@ impl ComparisonBuffers {
 }
 
 /// Whether the reference's row or column `at`, with its middle at `then`, is under the target where
-/// it was `seen` in the picture, or within a pixel of that.
-fn covered(at: usize, side: usize, then: f64, seen: f64) -> bool {
-    (then + at as f64 - (side as f64 - 1.0) / 2.0 - seen).abs() <= side as f64 / 2.0 + 1.0
+/// it was `seen` in the picture, or within `margin_px` of that.
+fn covered(at: usize, side: usize, then: f64, seen: f64, margin_px: f64) -> bool {
+    (then + at as f64 - (side as f64 - 1.0) / 2.0 - seen).abs() <= side as f64 / 2.0 + margin_px
 }
 
 /// Sums over the pixels that count.

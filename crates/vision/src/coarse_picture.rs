@@ -9,12 +9,14 @@ use crate::crop::replace_invalid;
 /// more slope than clouds have, and no turn is noticed; with half of it the noise of a block is
 /// twice as large, and faint clouds show no turn.
 pub(crate) const COARSENESS: usize = 8;
-/// Side of the blocks of the fine picture, px: trees and houses tell a turn four times as well in
-/// it. With half of it a registration costs four times as much.
+/// Side of the blocks of the fine picture, px: trees and houses are four times as many pixels in it,
+/// and tell smaller turns. With half of it a registration costs four times as much.
 pub(crate) const FINENESS: usize = 4;
-/// Most pixels of a fine picture: that of an image of 640x512 has 20 480. A larger image has none,
-/// as its coarse picture has as many. With twice as much a registration of 1280x720 costs 2 ms.
-const MOST_FINE: usize = 24_000;
+/// Most pixels of a fine picture: that of an image of 704x576 has 25 344. A larger image has none:
+/// the coarse picture of 1280x720, 14 400 pixels, is as fine in angle as the fine one of 640x360.
+/// With half of it an image of 640x512 has none; with three times as much one of 1280x720 has one,
+/// and its registration costs 2 ms.
+const MOST_FINE: usize = 26_000;
 /// How often the coarse picture is smoothed, each time with weights of a quarter, a half and a
 /// quarter for neighbours. With half of it noise keeps more of its slope, against the scene's.
 const SMOOTHED: usize = 3;
@@ -43,13 +45,17 @@ impl CoarsePictures {
             replace_invalid(fine);
             smooth(fine, between);
         } else {
-            fine.reshape(0, 0);
+            *fine = Plane::default();
         }
     }
 
     pub(crate) fn copy_from(&mut self, other: &Self) {
         self.coarse.copy_from(&other.coarse);
-        self.fine.copy_from(&other.fine);
+        if other.fine.width() > 0 {
+            self.fine.copy_from(&other.fine);
+        } else {
+            self.fine = Plane::default();
+        }
     }
 }
 

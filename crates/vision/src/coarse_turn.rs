@@ -13,6 +13,10 @@ use crate::scene_turn::SceneTurn;
 /// taken for roll.
 const ROLL_RAD_PER_S: f64 = 0.3;
 
+/// Most roll, rad, and zoom, a share, within the 0.6 s to a picture: by more the pictures have little
+/// in common, and it is a mistake. With half of it a zoom by 0.5 per second is refused.
+const MOST_BENT: f32 = 0.5;
+
 /// A pair of coarse pictures of an image, whose pixels are blocks of `side` px.
 struct PictureLevel<'a> {
     pair: PicturePair<'a>,
@@ -50,15 +54,27 @@ impl<'a> PictureLevel<'a> {
         SceneTurn::about(self.middle, shift, turn.zoom.into(), turn.roll.into())
     }
 
-    fn fit_near(&self, guess: SceneTurn, sd: f32) -> Option<PictureFit> {
-        self.pair.fit_near(self.in_pixels(guess), sd)
+    fn fit_near(&self, start: SceneTurn, expected: SceneTurn, sd: f32) -> Option<PictureFit> {
+        self.pair.fit_near(self.in_pixels(start), self.in_pixels(expected), sd)
     }
 
     /// The turn of a fit that is better than another turn.
-    fn if_better(&self, fit: PictureFit, than: SceneTurn, bar: Bar) -> Option<SceneTurn> {
-        let is_better = self.pair.is_better(&fit, self.in_pixels(than), bar);
-        is_better.then(|| self.in_image(fit.turn))
+    fn if_better(&self, fit: PictureFit, than: SceneTurn, bar: Bar) -> Option<FoundTurn> {
+        if fit.turn.zoom.abs().max(fit.turn.roll.abs()) > MOST_BENT {
+            return None;
+        }
+        let gain = self.pair.better_by(&fit, self.in_pixels(than), bar)?;
+        let is_significant = gain > Bar::STILL.significant;
+        Some(FoundTurn { turn: self.in_image(fit.turn), is_significant })
     }
+}
+
+/// A turn that the pictures show.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct FoundTurn {
+    pub(crate) turn: SceneTurn,
+    /// Whether it would be believed of a camera that stood still, by how much it explains.
+    pub(crate) is_significant: bool,
 }
 
 /// The turn of an image against an older one, if they determine one near a first guess and better
@@ -73,17 +89,37 @@ pub(crate) fn turn_between(
     guess: SceneTurn,
     since_s: f64,
     is_turning: bool,
-) -> Option<SceneTurn> {
-    let (bar, sd) =
-        (if is_turning { Bar::TURNING } else { Bar::STILL }, (ROLL_RAD_PER_S * since_s) as f32);
+) -> Option<FoundTurn> {
+    let bar = if is_turning { Bar::TURNING } else { Bar::STILL };
+    let sd = (ROLL_RAD_PER_S * since_s) as f32;
     let coarse = PictureLevel::new(&now.coarse, &then.coarse, COARSENESS)?;
     let fine = PictureLevel::new(&now.fine, &then.fine, FINENESS).map(PictureLevel::fine);
     let may_be_better = |level: &PictureLevel| level.may_be_better_near(guess, sd, bar);
     if !is_turning && !may_be_better(&coarse) && !fine.as_ref().is_some_and(may_be_better) {
         return None;
     }
-    let by_coarse = coarse.fit_near(guess, sd);
+    let by_coarse = coarse.fit_near(guess, guess, sd);
     let start = by_coarse.map_or(guess, |fit| coarse.in_image(fit.turn));
-    let turn = fine.and_then(|fine| fine.if_better(fine.fit_near(start, sd)?, guess, bar));
+    let turn = fine.and_then(|fine| fine.if_better(fine.fit_near(start, guess, sd)?, guess, bar));
     turn.or_else(|| coarse.if_better(by_coarse?, guess, bar))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_turn_is_the_same_in_pixels_and_in_the_image() {
+        let picture = Plane::from_fn(40, 30, |_, _| 0.0);
+        let level = PictureLevel::new(&picture, &picture, 8).unwrap();
+        assert_eq!((level.middle.x, level.middle.y), (159.5, 119.5));
+        let turn = PictureTurn { shift: [1.5, -2.0], zoom: 0.1, roll: 0.2 };
+        let in_image = level.in_image(turn);
+        // Ten pixels right of the middle: 10 + 1.5 + 0.1 * 10 right, -2 + 0.2 * 10 down.
+        let was = in_image.place(ImagePoint { x: 159.5 + 80.0, y: 119.5 });
+        assert!((was.x - 159.5 - 100.0).hypot(was.y - 119.5) < 1e-4, "{was:?}");
+        let PictureTurn { shift: [x, y], zoom, roll } = level.in_pixels(in_image);
+        let off = [x - 1.5, y + 2.0, zoom - 0.1, roll - 0.2];
+        assert!(off.iter().all(|off| off.abs() < 1e-5), "{off:?}");
+    }
 }

@@ -73,8 +73,8 @@ impl Background {
         buffers: &'a mut EmptySceneBuffers,
     ) -> EmptyScene<'a> {
         let turn = turned.and_then(self.turned.inverse());
-        let sides = [self.ratios.width(), self.ratios.height()].map(|side| side / 2);
-        let [x, y] = sides.map(|cell| middle_of(cell as f64, self.coarseness));
+        let middle = [self.ratios.width(), self.ratios.height()].map(|n| (n as f64 - 1.0) / 2.0);
+        let [x, y] = middle.map(|cell| middle_of(cell, self.coarseness));
         let reach_px = uneven_turn::reach_px(turn.moves(ImagePoint { x, y }));
         let reach = (reach_px / self.coarseness as f64).round() as usize;
         let ratios = if reach > 0 { buffers.widened(&self.ratios, reach) } else { &self.ratios };

@@ -233,8 +233,9 @@ impl ImageTracker {
                 && followed.target.is_seen()
             {
                 let gone = [at.x - first.x, at.y - first.y];
-                let (now, first) = (turned.place(at), then.place(*first));
-                let in_scene = [now.x - first.x, now.y - first.y];
+                // Where what was at its first place is now.
+                let first = then.and_then(turned.inverse()).place(*first);
+                let in_scene = [at.x - first.x, at.y - first.y];
                 // What is on the lens keeps its place in the image, what belongs to the scene its
                 // place there: only the smaller of both distances shows a target.
                 *has_moved |= gone[0].hypot(gone[1]).min(in_scene[0].hypot(in_scene[1])) > side;

@@ -22,7 +22,7 @@ pub(crate) enum TakenUpBy {
     Given,
     /// The detector.
     Detected {
-        /// Where it was found, and how far the scene had moved then, px.
+        /// Where it was found, and where what was in that image was at the beginning.
         first: ImagePoint,
         turned: SceneTurn,
         /// Whether it has been elsewhere since or before, both in the image and in the scene, so

@@ -19,7 +19,8 @@ pub(crate) struct FrameInput<'a> {
     pub(crate) snapshot: Option<&'a BackgroundSnapshot>,
     /// What the scene looked like lately.
     pub(crate) scene: &'a SceneMemory,
-    /// Where what was in the image before is now, as the camera has turned.
+    /// Where what was in the image registered before, up to 0.1 s ago, is now, as the camera has
+    /// turned; nothing has moved if this image is not registered.
     pub(crate) scene_moved: SceneTurn,
     /// Whether it is this target's turn to be searched for, if it is lost: one per frame, as a
     /// search costs as much as many targets that are followed.

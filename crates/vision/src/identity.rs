@@ -199,10 +199,10 @@ impl TargetIdentity {
     /// Least speed with which a lost target can have come to a place by now, px/s.
     fn least_speed(&self, state: &TargetBelief, frame: FrameInput<'_>, place: ImagePoint) -> f64 {
         let Some(last) = self.last_in_scene else { return 0.0 };
-        let now = frame.scene.turned().place(place);
+        let last = frame.scene.turned().inverse().place(last);
         let lost_s = self.probation.as_ref().map_or(state.unseen_s, |probation| probation.unseen_s);
-        // |place in the scene now - place in the scene when last seen| / time lost.
-        (now.x - last.x).hypot(now.y - last.y) / lost_s.max(frame.interval)
+        // |place now - where what was at its last place is now| / time lost.
+        (place.x - last.x).hypot(place.y - last.y) / lost_s.max(frame.interval)
     }
 
     /// Updates the probability that what is followed is the target and neither the scene nor noise,

@@ -8,7 +8,7 @@ use crossfix_correlation::Plane;
 
 use crate::ImagePoint;
 use crate::coarse_picture::{COARSENESS, CoarsePictures, CoarseScratch};
-use crate::coarse_turn::turn_between;
+use crate::coarse_turn::{FoundTurn, turn_between};
 use crate::crop::replace_invalid;
 use crate::jerk::RowGlance;
 use crate::registration::{LEAST_COMMON, PicturePair, STRIDE};
@@ -24,17 +24,21 @@ const SPACING_S: f64 = 0.6;
 /// Preferred age of the picture from which a change is computed, s: a target has moved by its own
 /// size by then. With half of it a target that has moved by half its size cancels by half.
 const CHANGED_S: f64 = 1.0;
-/// A camera stands still that has turned by less than this since it was last registered, px: noise
-/// makes 0.1 of it ...
+/// A camera stands still that has turned no place of the image by more than this since it was last
+/// registered, px ...
 const STILL_PX: f64 = 0.25;
-/// ... and is registered again after this long, s, unless it is jerked: with half of it an image
-/// of 640x512 costs 0.1 ms more. With half of the first noise alone has images registered.
+/// ... and is registered again after this long, s, unless it is jerked: with half of it an image of
+/// 640x512 costs 0.1 ms more. With half of the first what noise moves, 0.1 px, keeps more images
+/// registered.
 const STILL_S: f64 = 0.1;
 
-/// For this long after the camera has turned it counts as turning, s: a few images, of which one may
-/// show nothing. With half of it a shaken camera is as still as its sharpest turns are short; with
-/// twice as much the same.
+/// For this long after a turn that shows by itself the camera counts as turning, s: a few images, of
+/// which one may show nothing. With half of it a shaken camera counts as still between its turns;
+/// with twice as much the same.
 const TURNS_ON_S: f64 = 0.2;
+/// Roll and zoom of an older picture may have drifted by as much as they change in this time, s: its
+/// turn is the sum of many. With half of it they are put right half as fast where little shows them.
+const DRIFTS_S: f64 = 0.1;
 /// Least turn from one image to the next that is believed, px: with half of it a sea is registered
 /// along the way of its waves, ...
 const LEAST_TURN_PX: f64 = 2.0;
@@ -86,7 +90,7 @@ impl ScenePicture {
 pub(crate) struct SceneMemory {
     /// The newest first.
     pictures: Vec<ScenePicture>,
-    /// The coarse picture of the image that was registered last, ...
+    /// The coarse pictures of the image that was registered last, ...
     coarse: CoarsePictures,
     /// ... what it was before it was smoothed, and the same of the image registered before that;
     /// empty if there was none.
@@ -96,7 +100,7 @@ pub(crate) struct SceneMemory {
     sums: Vec<f32>,
     /// Number of pictures kept since the beginning.
     count: u64,
-    /// For how long the camera counts as turning yet, and the time since it was registered last, s.
+    /// For how long the camera still counts as turning, and the time since it was registered last, s.
     turning_s: f64,
     unregistered_s: f64,
     glance: RowGlance,
@@ -140,7 +144,7 @@ impl SceneMemory {
     pub(crate) fn clear(&mut self) {
         self.turned = self.turned();
         self.pictures.clear();
-        (self.glance, self.turning_s) = (RowGlance::default(), TURNS_ON_S);
+        (self.glance, self.turning_s) = (RowGlance::default(), 0.0);
         // The next image is registered with none before it.
         self.sharp = Plane::default();
     }
@@ -149,7 +153,9 @@ impl SceneMemory {
     /// that one the other pictures are shifted as when it was taken. Where the camera may have
     /// turned far, or the picture shows nothing, the image registered before says where to begin.
     /// A camera that stood still lately is registered only now and then.
-    pub(crate) fn register(&mut self, image: &Plane, interval: f64) {
+    ///
+    /// Returns where what was in the image registered before is now.
+    pub(crate) fn register(&mut self, image: &Plane, interval: f64) -> SceneTurn {
         self.unregistered_s += interval;
         for picture in &mut self.pictures {
             picture.age_s += interval;
@@ -162,46 +168,53 @@ impl SceneMemory {
         // does.
         let is_kept = self.pictures.first().is_none_or(|newest| newest.age_s >= SPACING_S);
         if !is_time && !is_kept {
-            return;
+            return SceneTurn::none();
         }
         let since_s = std::mem::take(&mut self.unregistered_s);
         std::mem::swap(&mut self.sharp_before, &mut self.sharp);
         self.coarse.take(image, &mut self.sharp, &mut self.scratch);
-        let Some(before) = self.pictures.first().map(|newest| newest.turn) else { return };
-        let turn =
-            if self.is_unregistered { before } else { self.turn_from(before, is_jerked, since_s) };
+        self.turning_s = (self.turning_s - since_s).max(0.0);
+        let Some(before) = self.pictures.first().map(|newest| newest.turn) else {
+            return SceneTurn::none();
+        };
+        let found = if self.is_unregistered {
+            FoundTurn { turn: before, is_significant: false }
+        } else {
+            self.turn_from(before, is_jerked, since_s)
+        };
         // Where what is in the image now was in the image before.
-        let step = turn.and_then(before.inverse());
+        let step = found.turn.and_then(before.inverse());
         for picture in &mut self.pictures {
             picture.turn = step.and_then(picture.turn);
         }
         let [right, down] = step.moves(middle(image));
         self.shifted = [self.shifted[0] + right, self.shifted[1] + down];
-        self.note_turning(right.hypot(down), since_s);
-    }
-
-    /// Notes by how many px the image has moved since it was registered before.
-    fn note_turning(&mut self, px: f64, since_s: f64) {
-        self.turning_s =
-            if px >= STILL_PX { TURNS_ON_S } else { (self.turning_s - since_s).max(0.0) };
+        if found.is_significant && farthest_moved(step, image) >= STILL_PX {
+            self.turning_s = TURNS_ON_S;
+        }
+        step.inverse()
     }
 
     /// Where what is in the image was in the newest picture, which was `before` for the image
     /// registered `since_s` seconds before. What neither of the two shows has not turned.
-    fn turn_from(&mut self, before: SceneTurn, is_jerked: bool, since_s: f64) -> SceneTurn {
+    fn turn_from(&mut self, before: SceneTurn, is_jerked: bool, since_s: f64) -> FoundTurn {
+        let unknown = |turn: SceneTurn| FoundTurn { turn, is_significant: false };
         let seen = self.seen_near(before, since_s);
         // The picture shows a large turn only near a first guess, and that of a scene which is fine
         // or changes quickly not at all.
         if !is_jerked && (seen.is_some() || !self.is_turning()) {
-            return seen.unwrap_or(before);
+            return seen.unwrap_or(unknown(before));
         }
-        let Some(shift) = self.shift_since(since_s) else { return seen.unwrap_or(before) };
+        let Some(shift) = self.shift_since(since_s) else {
+            return seen.unwrap_or(unknown(before));
+        };
         let guess = SceneTurn::shift(shift).and_then(before);
-        self.seen_near(guess, since_s).unwrap_or(guess)
+        let found = self.seen_near(guess, since_s).unwrap_or(unknown(guess));
+        FoundTurn { is_significant: true, ..found }
     }
 
     /// The turn against the newest picture, if it determines one near a first guess.
-    fn seen_near(&self, guess: SceneTurn, since_s: f64) -> Option<SceneTurn> {
+    fn seen_near(&self, guess: SceneTurn, since_s: f64) -> Option<FoundTurn> {
         let then = &self.pictures.first()?.coarse;
         turn_between(&self.coarse, then, guess, since_s, self.is_turning())
     }
@@ -228,11 +241,12 @@ impl SceneMemory {
         }
         // Each picture is registered itself, so that errors do not add up from picture to picture.
         if !self.is_unregistered {
-            for picture in &mut self.pictures {
-                let is_turning = self.turning_s > 0.0;
+            let is_turning = self.is_turning();
+            // The newest one has just been.
+            for picture in self.pictures.iter_mut().skip(1) {
                 let (now, then) = (&self.coarse, &picture.coarse);
-                picture.turn = turn_between(now, then, picture.turn, STILL_S, is_turning)
-                    .unwrap_or(picture.turn);
+                let found = turn_between(now, then, picture.turn, DRIFTS_S, is_turning);
+                picture.turn = found.map_or(picture.turn, |found| found.turn);
             }
         }
         self.turned = self.turned();
@@ -291,6 +305,14 @@ fn between_four(picture: &Plane, [x, y]: [f32; 2]) -> Option<f32> {
     let along = |row: &[f32]| row[column] + right * (row[column + 1] - row[column]);
     let [above, below] = [row, row + 1].map(|row| along(picture.row(row)));
     Some(above + down * (below - above))
+}
+
+/// How far a turn moves the middle of an image or a corner, px: the farthest of them.
+fn farthest_moved(turn: SceneTurn, image: &Plane) -> f64 {
+    let [right, down] = [image.width(), image.height()].map(|side| side as f64 - 1.0);
+    let places = [[0.0, 0.0], [right, 0.0], [0.0, down], [right, down], [right / 2.0, down / 2.0]];
+    let moved = places.map(|[x, y]| turn.moves(ImagePoint { x, y }));
+    moved.iter().map(|[right, down]| right.hypot(*down)).fold(0.0, f64::max)
 }
 
 /// The middle of an image.

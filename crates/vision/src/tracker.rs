@@ -234,12 +234,11 @@ impl ImageTracker {
 
     /// Registers an image with the scene, and returns where what was in the image before is now.
     fn register(&mut self, image: &Plane, interval: f64) -> SceneTurn {
-        let before = self.scene.turned();
         if self.config.algorithm == Algorithm::Posterior {
-            self.scene.register(image, interval);
+            self.scene.register(image, interval)
+        } else {
+            SceneTurn::none()
         }
-        let after = self.scene.turned();
-        before.and_then(after.inverse())
     }
 
     /// The lost target whose turn it is to be searched for.

@@ -1,4 +1,4 @@
-//! How far a place may lie from where one shift of the whole scene puts it: for the comparison of
+//! How far a place may lie from where the shift, roll and zoom of the whole scene put it: for the comparison of
 //! what is followed with what was there before (`identity.rs`), and for what the scene looks like
 //! to a search (`empty_scene.rs`).
 

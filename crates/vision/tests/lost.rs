@@ -208,6 +208,8 @@ fn a_cloud_is_not_taken_for_a_target_that_has_left_the_image_of_a_camera_that_ro
             let track = step(&mut tracker, &image, frame);
             let is_taken = track.phase == TrackPhase::Tracking && off(&track, cloud) < 6.0;
             taken += u32::from(frame >= 50 && is_taken);
+            let is_followed = track.phase == TrackPhase::Tracking && off(&track, at) < 3.0;
+            assert!(is_followed || frame != 25, "seed {seed}: it is lost before it leaves");
         }
         // As long as what a search finds is on probation; of one whose roll is not registered it is
         // taken in all 80 images in half of ten scenes.

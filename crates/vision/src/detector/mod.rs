@@ -64,9 +64,10 @@ const SWAYS: f64 = 3.0;
 /// 90.6) and no more false ones, but a mast swings as far. With half of the second the noise of a
 /// plot's place counts as motion.
 const PLACE_ERRORS: f64 = 2.0;
-/// ... and this share of how far the scene has turned meanwhile: what is near moves farther in the
-/// image of a camera that is moved than what is far, and the edges of a wide image farther than its
-/// middle. With half of it posts that move a fifth farther than the clouds behind them are found.
+/// It has also moved by more than this share of what a scene without texture has turned meanwhile
+/// faster than [`FAST_TURN_PX_S`]: what is near moves farther in the image of a camera that is moved
+/// than what is far. With half of it posts that move a fifth farther than the clouds behind them are
+/// found.
 const PARALLAX: f64 = 0.3;
 /// Margin that is asked above the odds of chance, nats: the images of a minute are not as many
 /// chances as they seem, as noise, clouds and leaves of one image are those of the next. With 2

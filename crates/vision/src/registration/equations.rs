@@ -4,23 +4,24 @@ use nalgebra::{SMatrix, SVector};
 
 use super::LEAST_COMMON;
 
-/// Longest step, pixels: a longer one is a mistake, and is cut to this. With half of it shifts of
-/// more than `STEPS` pixels are not reached.
+/// Longest step, pixels, of the shift, and at the picture's reach of roll and zoom: a longer one is
+/// a mistake, and is cut to this. With half of it turns of more than six pixels are not reached.
 const LONGEST_STEP: f32 = 2.0;
-/// Sums of a pixel's products that are made at a time, for vector instructions: six are needed.
-const LANES: usize = 8;
-/// Pixels that tell as much as an independent one: the pictures are smooth. With half of it roll and
-/// zoom are freer by the root of two.
+/// Sums of a pixel's products that are made at a time, for vector instructions: six are needed, and
+/// half of it has no room for them.
+const PADDED_TERMS: usize = 8;
+/// Pixels, of those that are summed, that tell as much as an independent one: the pictures are
+/// smooth. With half of it roll and zoom are freer, by the root of two.
 const INDEPENDENT: f32 = 18.0;
 /// Least variance of a pixel's difference, levels^2: that of rounding. With half of it the same.
 const LEAST_VARIANCE: f32 = 1e-4;
 
-/// Normal equations of one step of the registration: for the shift, for roll and zoom in pixels at
+/// Normal equations of one step of the registration: for the shift, for zoom and roll in pixels at
 /// the reach of the picture, and for the change of brightness.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct RegistrationEquations {
     /// Weighted sums of the products of all pairs of a pixel's four slopes, 1, and its difference.
-    sums: [[f32; LANES]; 6],
+    sums: [[f32; PADDED_TERMS]; 6],
 }
 
 impl RegistrationEquations {
@@ -46,7 +47,7 @@ impl RegistrationEquations {
 
     /// By how much the squared differences become less by the step, in units of one pixel's mean.
     pub(super) fn gain(&self, off: [f32; 2], sd: f32) -> f32 {
-        let Some(step) = self.step(off, sd) else { return 0.0 };
+        let Some(step) = self.solution(off, sd) else { return 0.0 };
         let (n, brighter) = (self.weight(), self.brighter());
         // b' A^-1 b, less what a change of brightness alone explains.
         let explained: f32 = (0..5).map(|i| step[i] * self.sums[i][5]).sum();
@@ -54,10 +55,17 @@ impl RegistrationEquations {
         (explained - n * brighter.powi(2)) / (squares / n).max(LEAST_VARIANCE)
     }
 
-    /// The step that solves the equations; `None` where they do not determine the shift. `off` is
-    /// by how much roll and zoom, each in pixels at the picture's reach, are short of what was
-    /// expected, and `sd` the standard deviation of that.
-    pub(super) fn step(&self, off: [f32; 2], sd: f32) -> Option<SVector<f32, 5>> {
+    /// The step of the shift, of zoom and of roll; `None` where the equations do not determine the
+    /// shift. See [`Self::solution`].
+    pub(super) fn step(&self, off: [f32; 2], sd: f32) -> Option<[f32; 4]> {
+        let solution = self.solution(off, sd)?;
+        Some(std::array::from_fn(|i| solution[i].clamp(-LONGEST_STEP, LONGEST_STEP)))
+    }
+
+    /// The step that solves the equations, with the change of brightness. `off` is by how much zoom
+    /// and roll, each in pixels at the picture's reach, are short of what is expected of them, and
+    /// `sd` the standard deviation of that.
+    fn solution(&self, off: [f32; 2], sd: f32) -> Option<SVector<f32, 5>> {
         let n = self.weight();
         if n < LEAST_COMMON {
             return None;
@@ -82,6 +90,6 @@ impl RegistrationEquations {
             normal[(i, i)] += prior;
             right[i] += prior * off;
         }
-        Some(normal.cholesky()?.solve(&right).map(|step| step.clamp(-LONGEST_STEP, LONGEST_STEP)))
+        Some(normal.cholesky()?.solve(&right))
     }
 }

@@ -1,6 +1,7 @@
 //! How badly two pictures fit, tile by tile, and whether that shows a turn.
 
 use super::LEAST_COMMON;
+use crate::noise::median;
 
 /// Weighted sums over the pixels of a tile.
 #[derive(Clone, Copy, Debug, Default)]
@@ -29,7 +30,7 @@ impl TileSums {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Bar {
     /// Least reduction of the misfit, in units of one pixel's mean misfit.
-    pub(super) significant: f32,
+    pub(crate) significant: f32,
     /// Least share of it away from the tiles that gain most.
     elsewhere: f32,
 }
@@ -41,9 +42,9 @@ impl Bar {
     /// twentieth (of the second) away from it; with half of it those alone are enough.
     pub(crate) const STILL: Self = Self { significant: 120.0, elsewhere: 0.1 };
     /// Where it turned a moment ago, and is more likely to turn on than not: what is better is
-    /// believed. With the bar of one that stood still a real picture that turns by 4 px from image
+    /// believed. With the bar of one that stood still a real picture that turns by 3.8 px from image
     /// to image is off by 2 px in each, as its edges, in a part of it, bring most of the gain; with
-    /// twice the first of these by a tenth more than with it.
+    /// half of the first of these the same as with it.
     pub(crate) const TURNING: Self = Self { significant: 30.0, elsewhere: 0.0 };
 }
 
@@ -64,6 +65,9 @@ const MOST_TILES: f32 = 0.72;
 /// the best lies three above what chance makes of one. With half of it a clear sky turns by chance
 /// where few tiles stay in view.
 const MOST_TILES_SDS: f32 = 4.0;
+/// A tile does not fit if its misfit is this many times the usual one, the median of all. With half
+/// of it half of the tiles of a scene do not fit, by noise.
+const MISFITTING: f32 = 2.0;
 /// Least reduction of the misfit by such a shift, in units of one pixel's mean misfit: the best of
 /// all those searched for brings up to 150 in noise and 200 where targets cross a clear sky, and
 /// over waves 1500. With half of it either may be a turn.
@@ -101,17 +105,35 @@ impl TileMisfit {
 pub(super) struct Misfits(pub(super) [[TileMisfit; TILES[0]]; TILES[1]]);
 
 impl Misfits {
-    /// Whether these misfits are less than `before` by more than noise makes them, and also away
-    /// from the two tiles that have gained most: a target may be in one of these, and have been in
-    /// the other.
-    pub(super) fn are_better_than(&self, before: &Self, bar: Bar) -> bool {
+    /// By how much these misfits are less than `before`, in units of one pixel's mean misfit, if
+    /// that is more than noise makes it, and also away from the two tiles that have gained most: a
+    /// target may be in one of these, and have been in the other.
+    pub(super) fn better_by(&self, before: &Self, bar: Bar) -> Option<f32> {
         let whole = self.gain(before, &[]);
-        if whole <= bar.significant * self.of_pixel() {
-            return false;
+        let gain = whole / self.of_pixel().max(f32::MIN_POSITIVE);
+        if gain <= bar.significant {
+            return None;
         }
         let first = self.most_gained(before, &[]);
         let second = self.most_gained(before, &[first]);
-        self.gain(before, &[first, second]) > bar.elsewhere * whole
+        let is_elsewhere = self.gain(before, &[first, second]) > bar.elsewhere * whole;
+        (is_elsewhere && self.explain_most_of(before)).then_some(gain)
+    }
+
+    /// Whether most tiles that did not fit `before`, if any stood out, fit now: where targets cross a
+    /// clear sky, a turn that explains some of them leaves the others.
+    fn explain_most_of(&self, before: &Self) -> bool {
+        let mut means: Vec<f32> = tiles().map(|[x, y]| before.0[y][x].mean()).collect();
+        let usual = median(&mut means);
+        let (mut misfits, mut explained) = (0, 0);
+        for [x, y] in tiles() {
+            let (now, before) = (self.0[y][x], before.0[y][x].mean());
+            if now.weights > 0.0 && before > MISFITTING * usual + ROUNDING {
+                misfits += 1;
+                explained += u32::from(now.mean() - usual < (before - usual) / 2.0);
+            }
+        }
+        2 * explained >= misfits
     }
 
     /// Whether these misfits are less than `before` in so many more tiles than they are larger in

@@ -44,7 +44,7 @@ const LEAST_OUTLYING: f32 = 0.5;
 const LANES: usize = 16;
 /// Farthest shift of the next image that is searched for, pixels of a coarse picture per axis, of 8
 /// px of the image each. The best of all is believed up to one less, 64 px: at the end of the search
-/// it may be better still beyond. With half of it no faster turn than 32 px from one image to the
+/// it may be better still beyond. With half of it no faster turn than 28 px from one image to the
 /// next is found over waves, and 0.1 s of a slow one.
 const FARTHEST: i32 = 9;
 /// Farthest that a registration may lead from the best whole shift, pixels per axis: half a pixel,
@@ -55,7 +55,7 @@ const NEAR_WHOLE: f32 = 0.75;
 pub(crate) const LEAST_COMMON: f32 = 50.0;
 
 /// Indices of a row that, moved by `by`, are in the row together with the next index.
-pub(crate) fn overlap(side: usize, by: isize) -> std::ops::Range<usize> {
+fn overlap(side: usize, by: isize) -> std::ops::Range<usize> {
     let side = side as isize;
     let first = (-by).clamp(0, side);
     first as usize..(side - 1 - by).clamp(first, side) as usize
@@ -158,7 +158,7 @@ impl<'a> PicturePair<'a> {
         let Self { now, then, .. } = self;
         let [middle_x, middle_y] = self.middle();
         let PictureTurn { shift, zoom, roll } = at;
-        let last = [then.width(), then.height()].map(|side| side as f32 - 3.0);
+        let last = [then.width(), then.height()].map(|side| side as f32 - 2.0);
         let (width, samples) = (then.width(), then.samples());
         for y in (0..now.height()).step_by(self.stride) {
             let line = now.row(y);
@@ -169,7 +169,7 @@ impl<'a> PicturePair<'a> {
                 let was_x = x as f32 + row_x + zoom * right;
                 let was_y = row_y + roll * right;
                 // Four pixels about it are needed on each axis.
-                if !(was_x >= 1.0 && was_y >= 1.0 && was_x <= last[0] && was_y <= last[1]) {
+                if !(was_x >= 1.0 && was_y >= 1.0 && was_x < last[0] && was_y < last[1]) {
                     continue;
                 }
                 let (column, row) = (was_x as usize, was_y as usize);
@@ -238,20 +238,25 @@ impl<'a> PicturePair<'a> {
     }
 
     /// The turn to which the registration leads from a start (Lucas and Kanade 1981); `None` where
-    /// the pictures do not determine it. Roll and zoom are expected to stay, but for a standard
-    /// deviation `sd` per reach of the picture.
-    pub(crate) fn fit_near(&self, start: PictureTurn, sd: f32) -> Option<PictureFit> {
+    /// the pictures do not determine it. Roll (rad) and zoom (a share) are those of `expected`, but
+    /// for a standard deviation `sd`.
+    pub(crate) fn fit_near(
+        &self,
+        start: PictureTurn,
+        expected: PictureTurn,
+        sd: f32,
+    ) -> Option<PictureFit> {
         let reach = self.reach();
         let mut fit = self.fit_at(start);
         for _ in 0..self.steps {
             let mut turn = fit.turn;
-            let off = [start.zoom - turn.zoom, start.roll - turn.roll].map(|off| off * reach);
+            let off = [expected.zoom - turn.zoom, expected.roll - turn.roll].map(|off| off * reach);
             let step = fit.equations.step(off, sd * reach)?;
             turn.shift = [turn.shift[0] + step[0], turn.shift[1] + step[1]];
             turn.zoom += step[2] / reach;
             turn.roll += step[3] / reach;
             fit = self.fit_at(turn);
-            if step.fixed_rows::<4>(0).abs().sum() < SETTLED {
+            if step.iter().map(|step| step.abs()).sum::<f32>() < SETTLED {
                 break;
             }
         }
@@ -265,19 +270,19 @@ impl<'a> PicturePair<'a> {
         equations.gain([0.0; 2], sd * self.reach()) > bar.significant
     }
 
-    /// Whether a fit explains more than another turn by more than noise would, or a target that
-    /// moves: a clear sky shows no turn.
-    pub(crate) fn is_better(&self, fit: &PictureFit, than: PictureTurn, bar: Bar) -> bool {
+    /// How much more a fit explains than another turn, in units of one pixel's mean misfit, if that
+    /// is more than noise would, or a target that moves: a clear sky shows no turn.
+    pub(crate) fn better_by(&self, fit: &PictureFit, than: PictureTurn, bar: Bar) -> Option<f32> {
         let of = |fit: &PictureFit| fit.misfits(fit.equations.brighter());
-        of(fit).are_better_than(&of(&self.fit_at(than)), bar)
+        of(fit).better_by(&of(&self.fit_at(than)), bar)
     }
 
-    /// The shift since the image before, pixels, up to `FARTHEST` per axis. `None` where most of
+    /// The shift since the image before, pixels, less than `FARTHEST` per axis. `None` where most of
     /// the image does not show it.
     pub(crate) fn shift(&self) -> Option<[f32; 2]> {
         let whole = self.best_whole_shift()?;
         let start = PictureTurn::of_shift(whole);
-        let fit = self.fit_near(start, 0.0)?;
+        let fit = self.fit_near(start, start, 0.0)?;
         // The best whole shift is the nearest one to the best of all; what leads farther away is
         // fixed to the image, as the edge of a sky that is too bright.
         let is_near =
@@ -404,14 +409,27 @@ mod tests {
             )
         });
         let pair = PicturePair::new(&now, &then).unwrap();
-        let fit = pair.fit_near(PictureTurn::default(), 0.1).unwrap();
+        let fit = pair.fit_near(PictureTurn::default(), PictureTurn::default(), 0.1).unwrap();
         let PictureTurn { shift: [x, y], zoom, roll } = fit.turn;
         assert!((x - 1.3).hypot(y + 0.7) < 0.05, "{:?}", fit.turn);
         assert!((zoom - 0.01).abs() < 1e-3 && (roll - 0.03).abs() < 1e-3, "{:?}", fit.turn);
-        assert!(pair.is_better(&fit, PictureTurn::default(), Bar::STILL));
-        assert!(!pair.is_better(&pair.fit_at(PictureTurn::default()), fit.turn, Bar::TURNING));
-        let stiff = pair.fit_near(PictureTurn::default(), 0.0).unwrap().turn;
+        assert!(pair.better_by(&fit, PictureTurn::default(), Bar::STILL).is_some());
+        let unmoved = pair.fit_at(PictureTurn::default());
+        assert!(pair.better_by(&unmoved, fit.turn, Bar::TURNING).is_none());
+        let stiff = pair.fit_near(unmoved.turn, unmoved.turn, 0.0).unwrap().turn;
         assert!(stiff.zoom.abs() < 1e-3 && stiff.roll.abs() < 1e-3, "{stiff:?}");
+    }
+
+    #[test]
+    fn no_change_of_light_hides_that_a_turn_may_be_found() {
+        let (then, mut now) = (waves([80, 60], [0.0; 2]), waves([80, 60], [0.6, 0.2]));
+        let may_be_better = |now: &Plane| {
+            let pair = PicturePair::new(now, &then).unwrap();
+            pair.may_be_better_near(PictureTurn::default(), 0.01, Bar::STILL)
+        };
+        assert!(may_be_better(&now) && !may_be_better(&then));
+        now.samples_mut().iter_mut().for_each(|sample| *sample += 4.0);
+        assert!(may_be_better(&now));
     }
 
     #[test]
