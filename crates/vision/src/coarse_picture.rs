@@ -9,8 +9,8 @@ use crate::crop::replace_invalid;
 /// more slope than clouds have, and no turn is noticed; with half of it the noise of a block is
 /// twice as large, and faint clouds show no turn.
 pub(crate) const COARSENESS: usize = 8;
-/// Side of the blocks of the fine picture, px: trees and houses are four times as many pixels in it,
-/// and tell smaller turns. With half of it a registration costs four times as much.
+/// Side of the blocks of the fine picture, px: trees and houses are four times as many pixels in
+/// it, and tell smaller turns. With half of it a registration costs four times as much.
 pub(crate) const FINENESS: usize = 4;
 /// Most pixels of a fine picture: that of an image of 704x576 has 25 344. A larger image has none:
 /// the coarse picture of 1280x720, 14 400 pixels, is as fine in angle as the fine one of 640x360.

@@ -13,8 +13,8 @@ use crate::scene_turn::SceneTurn;
 /// instead of 87 (mean of twelve starts, from 81 to 90 each).
 const ROLL_RAD_PER_S: f64 = 0.6;
 
-/// Most roll, rad, and zoom, a share, within the 0.6 s to a picture: by more the pictures have little
-/// in common, and it is a mistake. With half of it a zoom by 0.5 per second is refused.
+/// Most roll, rad, and zoom, a share, within the 0.6 s to a picture: by more the pictures have
+/// little in common, and it is a mistake. With half of it a zoom by 0.5 per second is refused.
 const MOST_BENT: f32 = 0.5;
 
 /// A pair of coarse pictures of an image, whose pixels are blocks of `side` px.

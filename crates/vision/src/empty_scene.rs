@@ -65,8 +65,8 @@ impl Background {
         self.coarseness
     }
 
-    /// What the scene has in an image, of which `SceneMemory::turned` is given: the greatest of what
-    /// it had within the reach of the turn since, to the nearest cell.
+    /// What the scene has in an image, of which `SceneMemory::turned` is given: the greatest of
+    /// what it had within the reach of the turn since, to the nearest cell.
     pub(crate) fn seen_at<'a>(
         &'a self,
         turned: SceneTurn,

@@ -32,12 +32,13 @@ const STILL_PX: f64 = 0.25;
 /// registered.
 const STILL_S: f64 = 0.1;
 
-/// For this long after a turn that shows by itself the camera counts as turning, s: a few images, of
-/// which one may show nothing. With half of it a shaken camera counts as still between its turns;
-/// with twice as much the same.
+/// For this long after a turn that shows by itself the camera counts as turning, s: a few images,
+/// of which one may show nothing. With half of it a shaken camera counts as still between its
+/// turns; with twice as much the same.
 const TURNS_ON_S: f64 = 0.2;
-/// Roll and zoom of an older picture may have drifted by as much as they change in this time, s: its
-/// turn is the sum of many. With half of it they are put right half as fast where little shows them.
+/// Roll and zoom of an older picture may have drifted by as much as they change in this time, s:
+/// its turn is the sum of many. With half of it they are put right half as fast where little shows
+/// them.
 const DRIFTS_S: f64 = 0.1;
 /// Least turn from one image to the next that is believed, px: with half of it a sea is registered
 /// along the way of its waves, ...
@@ -100,7 +101,8 @@ pub(crate) struct SceneMemory {
     sums: Vec<f32>,
     /// Number of pictures kept since the beginning.
     count: u64,
-    /// For how long the camera still counts as turning, and the time since it was registered last, s.
+    /// For how long the camera still counts as turning, and the time since it was registered last,
+    /// s.
     turning_s: f64,
     unregistered_s: f64,
     glance: RowGlance,

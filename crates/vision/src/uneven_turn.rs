@@ -1,6 +1,6 @@
-//! How far a place may lie from where the shift, roll and zoom of the whole scene put it: for the comparison of
-//! what is followed with what was there before (`identity.rs`), and for what the scene looks like
-//! to a search (`empty_scene.rs`).
+//! How far a place may lie from where the shift, roll and zoom of the whole scene put it: for the
+//! comparison of what is followed with what was there before (`identity.rs`), and for what the
+//! scene looks like to a search (`empty_scene.rs`).
 
 /// Share of a camera's turn by which a place may have moved more or less than the turn that was
 /// found: one shift describes a turn, but it moves the edges of a picture of 60 degrees by a third

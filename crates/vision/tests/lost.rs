@@ -153,8 +153,8 @@ fn what_stands_out_of_no_single_image_is_found_again_by_several() {
     assert!(found >= 7, "{found} of 10 found");
 }
 
-/// Whether a target is found in the first image in which it shows again, elsewhere, of a camera that
-/// has turned all the time over things that look just like it.
+/// Whether a target is found in the first image in which it shows again, elsewhere, of a camera
+/// that has turned all the time over things that look just like it.
 fn is_found_at_once_among_others(seed: u64) -> bool {
     let mut scene = Scene::new(seed, 10.0, 2.0, 60.0);
     let at = |frame: u32| match frame {

@@ -195,7 +195,8 @@ mod tests {
         assert!(!others.iter().any(|one| found.holds(one)));
         assert!(!found.holds(&thing([0.0, 0.0], [-20.0, 0.0], 120.0)), "nobody knows");
         assert!(common(&[&scene(7, [60.0, 0.0]), &others]).is_none(), "few");
-        // The standard deviation of ten in a row is 2.87 of their distances; 92 and 74 px are asked.
+        // The standard deviation of ten in a row is 2.87 of their distances; 92 and 74 px are
+        // asked.
         for (apart, is_scene) in
             [([33.0, 0.0], true), ([31.0, 0.0], false), ([0.0, 27.0], true), ([0.0, 24.0], false)]
         {

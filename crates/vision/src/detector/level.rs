@@ -64,8 +64,8 @@ const LENS: f32 = 0.35;
 /// texture: the scene averages out of it. With four times as much what passes behind a reticle is
 /// found.
 const LENS_PX: f64 = 10.0;
-/// ... and over this time at least, s. With half of it a target that a camera follows is on the lens
-/// before it is found.
+/// ... and over this time at least, s. With half of it a target that a camera follows is on the
+/// lens before it is found.
 const LENS_S: f64 = 0.25;
 
 /// Time and camera direction of an image, for the background.

@@ -65,9 +65,9 @@ const SWAYS: f64 = 3.0;
 /// plot's place counts as motion.
 const PLACE_ERRORS: f64 = 2.0;
 /// It has also moved by more than this share of what a scene without texture has turned meanwhile
-/// faster than [`FAST_TURN_PX_S`]: what is near moves farther in the image of a camera that is moved
-/// than what is far. With half of it posts that move a fifth farther than the clouds behind them are
-/// found.
+/// faster than [`FAST_TURN_PX_S`]: what is near moves farther in the image of a camera that is
+/// moved than what is far. With half of it posts that move a fifth farther than the clouds behind
+/// them are found.
 const PARALLAX: f64 = 0.3;
 /// Margin that is asked above the odds of chance, nats: the images of a minute are not as many
 /// chances as they seem, as noise, clouds and leaves of one image are those of the next. With 2
@@ -111,9 +111,9 @@ const TURN_S: f64 = 0.2;
 /// anything is found where a head follows a target (reasoned, not measured).
 const FAST_TURN_PX_S: f64 = 120.0;
 
-/// Most by which the registration of a scene that stands still jumps in one image, px: the noise of a
-/// bare scene moves it by a pixel or two, and 20 px/s that are registered every 0.1 s are two. With
-/// half of it such a jump counts as a fast turn at more than 30 images per second.
+/// Most by which the registration of a scene that stands still jumps in one image, px: the noise of
+/// a bare scene moves it by a pixel or two, and 20 px/s that are registered every 0.1 s are two.
+/// With half of it such a jump counts as a fast turn at more than 30 images per second.
 const CORRECTION_PX: f64 = 4.0;
 
 /// A target that is followed already.
@@ -484,8 +484,8 @@ fn touches(known: &PixelBox, plot: &Plot) -> bool {
 }
 
 /// Whether a place has just come into view, as the scene turns by `turning` px/s: its background is
-/// not known, and what is cut by the border seems to move as it comes in. Twice the warm-up, so that
-/// a candidate is begun by what is seen whole.
+/// not known, and what is cut by the border seems to move as it comes in. Twice the warm-up, so
+/// that a candidate is begun by what is seen whole.
 fn has_come_into_view(place: ImagePoint, turning: [f64; 2], sides: [usize; 2]) -> bool {
     [place.x, place.y].iter().zip(turning).zip(sides).any(|((at, turning), side)| {
         let way = 2.0 * WARM_UP_S * turning;

@@ -42,9 +42,9 @@ impl Bar {
     /// twentieth (of the second) away from it; with half of it those alone are enough.
     pub(crate) const STILL: Self = Self { significant: 120.0, elsewhere: 0.1 };
     /// Where it turned a moment ago, and is more likely to turn on than not: what is better is
-    /// believed. With the bar of one that stood still a real picture that turns by 3.8 px from image
-    /// to image is off by 2 px in each, as its edges, in a part of it, bring most of the gain; with
-    /// half of the first of these the same as with it.
+    /// believed. With the bar of one that stood still a real picture that turns by 3.8 px from
+    /// image to image is off by 2 px in each, as its edges, in a part of it, bring most of the
+    /// gain; with half of the first of these the same as with it.
     pub(crate) const TURNING: Self = Self { significant: 30.0, elsewhere: 0.0 };
 }
 
@@ -120,8 +120,8 @@ impl Misfits {
         (is_elsewhere && self.explain_most_of(before)).then_some(gain)
     }
 
-    /// Whether most tiles that did not fit `before`, if any stood out, fit now: where targets cross a
-    /// clear sky, a turn that explains some of them leaves the others.
+    /// Whether most tiles that did not fit `before`, if any stood out, fit now: where targets cross
+    /// a clear sky, a turn that explains some of them leaves the others.
     fn explain_most_of(&self, before: &Self) -> bool {
         let mut means: Vec<f32> = tiles().map(|[x, y]| before.0[y][x].mean()).collect();
         let usual = median(&mut means);

@@ -20,8 +20,8 @@ pub(crate) const STRIDE: usize = 2;
 /// Most iterations of the registration. With half of it a shift of more than three of the longest
 /// steps is not reached.
 const STEPS: usize = 6;
-/// The same of fine pictures, which have four times as many pixels: they say the same as one in four
-/// of them. With half of it a registration costs twice as much, and is no better.
+/// The same of fine pictures, which have four times as many pixels: they say the same as one in
+/// four of them. With half of it a registration costs twice as much, and is no better.
 const FINE_STRIDE: usize = 3;
 /// They begin where the coarse ones have led. With half of it their last step is half a pixel.
 const FINE_STEPS: usize = 3;
@@ -43,9 +43,9 @@ const LEAST_OUTLYING: f32 = 0.5;
 /// for each other, and a search costs more.
 const LANES: usize = 16;
 /// Farthest shift of the next image that is searched for, pixels of a coarse picture per axis, of 8
-/// px of the image each. The best of all is believed up to one less, 64 px: at the end of the search
-/// it may be better still beyond. With half of it no faster turn than 28 px from one image to the
-/// next is found over waves, and 0.1 s of a slow one.
+/// px of the image each. The best of all is believed up to one less, 64 px: at the end of the
+/// search it may be better still beyond. With half of it no faster turn than 28 px from one image
+/// to the next is found over waves, and 0.1 s of a slow one.
 const FARTHEST: i32 = 9;
 /// Farthest that a registration may lead from the best whole shift, pixels per axis: half a pixel,
 /// and half of that. With half of it a shift half-way between two pixels stays at one of them.
@@ -263,8 +263,8 @@ impl<'a> PicturePair<'a> {
         Some(fit)
     }
 
-    /// Whether a better fit than at a turn is to be expected near it: by the first step alone, which
-    /// costs a fraction of all.
+    /// Whether a better fit than at a turn is to be expected near it: by the first step alone,
+    /// which costs a fraction of all.
     pub(crate) fn may_be_better_near(&self, turn: PictureTurn, sd: f32, bar: Bar) -> bool {
         let equations = self.fit_at(turn).equations;
         equations.gain([0.0; 2], sd * self.reach()) > bar.significant
@@ -277,8 +277,8 @@ impl<'a> PicturePair<'a> {
         of(fit).better_by(&of(&self.fit_at(than)), bar)
     }
 
-    /// The shift since the image before, pixels, less than `FARTHEST` per axis. `None` where most of
-    /// the image does not show it.
+    /// The shift since the image before, pixels, less than `FARTHEST` per axis. `None` where most
+    /// of the image does not show it.
     pub(crate) fn shift(&self) -> Option<[f32; 2]> {
         let whole = self.best_whole_shift()?;
         let start = PictureTurn::of_shift(whole);
