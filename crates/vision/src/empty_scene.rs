@@ -6,7 +6,7 @@ use crossfix_correlation::Plane;
 
 use crate::ImagePoint;
 use crate::scene_turn::SceneTurn;
-use crate::search_area::SearchArea;
+use crate::search_area::{SearchArea, middle_of};
 use crate::uneven_turn;
 
 /// What the scene looks like to a target's reference, in a picture in which it is known where the
@@ -19,11 +19,6 @@ pub(crate) struct Background {
     ratios: Plane,
     /// `SceneMemory::turned` when the picture was taken.
     turned: SceneTurn,
-}
-
-/// The middle of a column or row of cells of `side` px, px of the image.
-fn middle_of(cell: f64, side: usize) -> f64 {
-    cell * side as f64 + (side as f64 - 1.0) / 2.0
 }
 
 /// Memory for the [`EmptyScene`], which all targets share.

@@ -172,7 +172,12 @@ impl SearchArea {
 
     /// The middle of a column or row of the coarse picture, px of the full picture.
     pub(crate) fn middle(&self, index: usize) -> f64 {
-        let side = self.coarseness as f64;
-        index as f64 * side + (side - 1.0) / 2.0
+        middle_of(index as f64, self.coarseness)
     }
+}
+
+/// The middle of a column or row of a picture with pixels of `coarseness` px, px of the image.
+pub(crate) fn middle_of(index: f64, coarseness: usize) -> f64 {
+    let side = coarseness as f64;
+    index * side + (side - 1.0) / 2.0
 }

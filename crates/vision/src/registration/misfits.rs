@@ -123,14 +123,14 @@ impl Misfits {
     /// Whether most tiles that did not fit `before`, if any stood out, fit now: where targets cross
     /// a clear sky, a turn that explains some of them leaves the others.
     fn explain_most_of(&self, before: &Self) -> bool {
-        let mut means: Vec<f32> = tiles().map(|[x, y]| before.0[y][x].mean()).collect();
+        let mut means: Vec<f32> =
+            self.in_view_of_both(before).map(|(_, before)| before.mean()).collect();
         let usual = median(&mut means);
         let (mut misfits, mut explained) = (0, 0);
-        for [x, y] in tiles() {
-            let (now, before) = (self.0[y][x], before.0[y][x].mean());
-            if now.weights > 0.0 && before > MISFITTING * usual + ROUNDING {
+        for (now, before) in self.in_view_of_both(before) {
+            if before.mean() > MISFITTING * usual + ROUNDING {
                 misfits += 1;
-                explained += u32::from(now.mean() - usual < (before - usual) / 2.0);
+                explained += u32::from(now.mean() - usual < (before.mean() - usual) / 2.0);
             }
         }
         2 * explained >= misfits
@@ -141,13 +141,10 @@ impl Misfits {
     /// many. Tiles that one of the two shifts moves out of view say nothing.
     pub(super) fn are_better_in_most(&self, before: &Self) -> bool {
         let (mut better, mut worse) = (0.0_f32, 0.0_f32);
-        for [x, y] in tiles() {
-            let (now, before) = (self.0[y][x], before.0[y][x]);
-            if now.weights > 0.0 && before.weights > 0.0 {
-                let gain = before.mean() - now.mean();
-                better += f32::from(gain > ROUNDING);
-                worse += f32::from(gain < -ROUNDING);
-            }
+        for (now, before) in self.in_view_of_both(before) {
+            let gain = before.mean() - now.mean();
+            better += f32::from(gain > ROUNDING);
+            worse += f32::from(gain < -ROUNDING);
         }
         // By chance the difference of n votes has the variance n.
         let votes = better + worse;
@@ -155,6 +152,12 @@ impl Misfits {
             && self.gain(before, &[]) > LEAST_GAIN * self.of_pixel()
             && better > MOST_TILES * votes
             && better - worse > MOST_TILES_SDS * votes.sqrt()
+    }
+
+    /// Each tile's misfit and that `before`, of those that neither moves out of view.
+    fn in_view_of_both(&self, before: &Self) -> impl Iterator<Item = (TileMisfit, TileMisfit)> {
+        let both = tiles().map(|[x, y]| (self.0[y][x], before.0[y][x]));
+        both.filter(|(now, before)| now.weights > 0.0 && before.weights > 0.0)
     }
 
     /// One pixel's mean misfit.
