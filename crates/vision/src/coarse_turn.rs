@@ -9,8 +9,8 @@ use crate::scene_turn::SceneTurn;
 
 /// Standard deviation of the speed of roll, rad/s, and of zoom, 1/s: a camera that looks 30 degrees
 /// up and pans by 36 degrees a second rolls by 0.3 rad/s, and one in the hand or on a jerked head
-/// by twice that. With half of it the frames of a clip of such a head that are followed are 82 %
-/// instead of 87 (mean of twelve starts, from 81 to 90 each).
+/// by twice that. With half of it as many frames of the real clips before a moved camera are right,
+/// to half a percent.
 const ROLL_RAD_PER_S: f64 = 0.6;
 
 /// Most roll, rad, and zoom, a share, within the 0.6 s to a picture: by more the pictures have

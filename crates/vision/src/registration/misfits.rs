@@ -1,7 +1,6 @@
 //! How badly two pictures fit, tile by tile, and whether that shows a turn.
 
 use super::LEAST_COMMON;
-use crate::noise::median;
 
 /// Weighted sums over the pixels of a tile.
 #[derive(Clone, Copy, Debug, Default)]
@@ -65,9 +64,6 @@ const MOST_TILES: f32 = 0.72;
 /// the best lies three above what chance makes of one. With half of it a clear sky turns by chance
 /// where few tiles stay in view.
 const MOST_TILES_SDS: f32 = 4.0;
-/// A tile does not fit if its misfit is this many times the usual one, the median of all. With half
-/// of it half of the tiles of a scene do not fit, by noise.
-const MISFITTING: f32 = 2.0;
 /// Least reduction of the misfit by such a shift, in units of one pixel's mean misfit: the best of
 /// all those searched for brings up to 150 in noise and 200 where targets cross a clear sky, and
 /// over waves 1500. With half of it either may be a turn.
@@ -116,24 +112,7 @@ impl Misfits {
         }
         let first = self.most_gained(before, &[]);
         let second = self.most_gained(before, &[first]);
-        let is_elsewhere = self.gain(before, &[first, second]) > bar.elsewhere * whole;
-        (is_elsewhere && self.explain_most_of(before)).then_some(gain)
-    }
-
-    /// Whether most tiles that did not fit `before`, if any stood out, fit now: where targets cross
-    /// a clear sky, a turn that explains some of them leaves the others.
-    fn explain_most_of(&self, before: &Self) -> bool {
-        let mut means: Vec<f32> =
-            self.in_view_of_both(before).map(|(_, before)| before.mean()).collect();
-        let usual = median(&mut means);
-        let (mut misfits, mut explained) = (0, 0);
-        for (now, before) in self.in_view_of_both(before) {
-            if before.mean() > MISFITTING * usual + ROUNDING {
-                misfits += 1;
-                explained += u32::from(now.mean() - usual < (before.mean() - usual) / 2.0);
-            }
-        }
-        2 * explained >= misfits
+        (self.gain(before, &[first, second]) > bar.elsewhere * whole).then_some(gain)
     }
 
     /// Whether these misfits are less than `before` in so many more tiles than they are larger in
