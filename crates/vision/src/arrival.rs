@@ -5,6 +5,8 @@
 //! certainty. The pictures of the scene ([`crate::scene`]) can: under a target that has come from
 //! elsewhere one of them shows what it hides.
 
+use std::ops::Range;
+
 use crossfix_correlation::{Plane, Resampler, View};
 
 use crate::ImagePoint;
@@ -87,6 +89,8 @@ pub(crate) struct ArrivalEvidence {
 #[derive(Debug, Default)]
 pub(crate) struct ComparisonBuffers {
     now: Plane,
+    /// The columns and the rows of that which are inside the image.
+    inside: [Range<usize>; 2],
     before: Plane,
 }
 
@@ -170,6 +174,10 @@ impl ComparisonBuffers {
     ) {
         self.now.reshape(placed.reference.width(), placed.reference.height());
         let ImagePoint { x, y } = placed.place;
+        self.inside = [
+            inside(x, self.now.width(), image.width()),
+            inside(y, self.now.height(), image.height()),
+        ];
         resampler.resample(image, View { x, y, scale: 1.0, turn_rad: 0.0 }, &mut self.now);
         replace_invalid(&mut self.now);
     }
@@ -249,6 +257,14 @@ impl ComparisonBuffers {
             if is_straight { (1.0, 0.0) } else { (turn.scale(), turn.roll_rad()) };
         let view = View { x: then.x, y: then.y, scale, turn_rad };
         resampler.resample(picture.image(), view, &mut self.before);
+        // Beyond its border a picture shows nothing.
+        let (sin, cos) = turn_rad.sin_cos();
+        let [along, across] = [scale * cos, scale * sin];
+        let was_in_picture = |x: usize, y: usize| {
+            let [right, down] = [(x, width), (y, height)].map(|(at, side)| from_middle(at, side));
+            let [x, y] = [along * right - across * down, across * right + along * down];
+            picture.holds(ImagePoint { x: then.x + x, y: then.y + y })
+        };
         let mut sums = PixelSums::default();
         for y in 0..height {
             let row_covered =
@@ -261,9 +277,10 @@ impl ComparisonBuffers {
                 // Squared slope, by the differences from the left and the upper neighbour.
                 let slope = (before - left).powi(2) + (before - above).powi(2);
                 left = *before;
-                if !(row_covered
-                    && seen.is_some_and(|seen| covered(x, width, then.x, seen.x, margin_px)))
-                {
+                let is_covered = row_covered
+                    && seen.is_some_and(|seen| covered(x, width, then.x, seen.x, margin_px));
+                let is_in_image = self.inside[0].contains(&x) && self.inside[1].contains(&y);
+                if !is_covered && is_in_image && was_in_picture(x, y) {
                     sums.add(*reference, *now, *before, slope);
                 }
             }
@@ -275,7 +292,20 @@ impl ComparisonBuffers {
 /// Whether the reference's row or column `at`, with its middle at `then`, is under the target where
 /// it was `seen` in the picture, or within `margin_px` of that.
 fn covered(at: usize, side: usize, then: f64, seen: f64, margin_px: f64) -> bool {
-    (then + at as f64 - (side as f64 - 1.0) / 2.0 - seen).abs() <= side as f64 / 2.0 + margin_px
+    (then + from_middle(at, side) - seen).abs() <= side as f64 / 2.0 + margin_px
+}
+
+/// How far a column or row lies from the middle of all.
+fn from_middle(at: usize, side: usize) -> f64 {
+    at as f64 - (side as f64 - 1.0) / 2.0
+}
+
+/// The columns (or rows) of a reference with its middle at a place that lie inside an image.
+fn inside(place: f64, side: usize, of_image: usize) -> Range<usize> {
+    let first = place + from_middle(0, side);
+    let [start, end] = [-first, of_image as f64 - 1.0 - first];
+    let start = start.max(0.0).ceil() as usize;
+    start..((end + 1.0).clamp(0.0, side as f64) as usize).max(start)
 }
 
 /// Sums over the pixels that count.
