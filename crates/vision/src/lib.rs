@@ -73,6 +73,8 @@ mod uneven_turn;
 
 use std::fmt;
 
+use crossfix_correlation::Plane;
+
 pub use config::{
     Algorithm, DetectorConfig, GateRule, PaperConfig, TrackerConfig, TrackerConfigError,
 };
@@ -147,6 +149,14 @@ impl PixelBox {
         let (a, b) = (self.centre(), other.centre());
         (a.x - b.x).abs() < (self.width + other.width) / 2.0
             && (a.y - b.y).abs() < (self.height + other.height) / 2.0
+    }
+
+    /// Share of the box that lies within an image.
+    pub(crate) fn share_in_view(&self, image: &Plane) -> f64 {
+        let share = |first: f64, side: f64, end: usize| {
+            ((first + side).min(end as f64) - first.max(0.0)).max(0.0) / side
+        };
+        share(self.x, self.width, image.width()) * share(self.y, self.height, image.height())
     }
 
     /// The middle, as a place: the box of one pixel at (0, 0) has its middle at (0, 0).

@@ -36,7 +36,7 @@ use crate::search_area::{BestCell, SearchArea};
 use crate::search_memory::{SearchMap, SearchMemory};
 use crate::state::TargetBelief;
 use crate::tracker_part::TrackerPart;
-use crate::{ImagePoint, TrackerConfig};
+use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Probability in one place from which on the map has found the target. With 0.9 one drawn sequence
 /// in forty is lost for good, as something else is found and followed; with 0.999 an eighth more of
@@ -65,6 +65,12 @@ pub(crate) const CLEAR_FIND: ClearFind =
 /// own noise, and what interpolation leaves of the older picture's. With half of it noise looks
 /// like the target by up to twice the log likelihood ratio.
 const NOISE_OF_CHANGE: f32 = 1.6;
+
+/// Least share of a target's box that is in view where it is found again: a search continues the
+/// image beyond its border by what is at it, and so makes the tip of a tree there as large as a
+/// target. With half of it a zoomed clip has one for its drone for 28 images in a row; as it is, a
+/// large drone that comes in slowly is found up to half a second later.
+const LEAST_IN_VIEW: f64 = 0.5;
 
 /// A picture that is searched, the image or what has changed.
 #[derive(Clone, Copy)]
@@ -238,7 +244,10 @@ impl Sought<'_> {
         scratch: &mut Scratch,
     ) -> bool {
         let is_anothers = frame.others.iter().any(|other| other.holds(found.place));
+        let [width, height] = self.state.appearance.sides();
+        let found_box = PixelBox::about(found.place, width, height);
         !is_anothers
+            && found_box.share_in_view(frame.image) >= LEAST_IN_VIEW
             && self.identity.arrival_log_ratio(self.state, frame, found.place, scratch) >= 0.0
     }
 

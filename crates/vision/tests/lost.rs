@@ -216,3 +216,31 @@ fn a_cloud_is_not_taken_for_a_target_that_has_left_the_image_of_a_camera_that_ro
         assert!(taken <= 15, "seed {seed}: taken in {taken} images");
     }
 }
+
+/// A target leaves the image above. Below, the tops of trees reach into the image and out of it as
+/// the camera nods: cut by the border they are as bright and as large as the target.
+#[test]
+fn a_tree_at_the_border_is_not_taken_for_a_target_that_has_left_the_image() {
+    let (mut taken, mut longest) = (0, 0);
+    for seed in 0..6 {
+        let mut scene = Scene::new(seed, 3.0, 2.0, 60.0);
+        let mut tracker = tracker_on([120.0, 40.0]);
+        let mut taken_here = 0;
+        for frame in 0..200 {
+            let down = 8.0 * (frame as f32 / 25.0 * 1.2).sin();
+            let at = [120.0, 40.0 - 1.2 * frame as f32];
+            let top_of_trees = |x: f32| 177.0 + 8.0 * (x / 6.0).sin() * (x / 23.0 + 1.0).sin();
+            let image = scene.image_with(Some(at), [0.0, down], |x, y| {
+                60.0 * (y + down - top_of_trees(x)).clamp(0.0, 1.0)
+            });
+            let track = step(&mut tracker, &image, frame);
+            let is_taken = track.phase == TrackPhase::Tracking && track.position.y > 120.0;
+            taken_here = if is_taken { taken_here + 1 } else { 0 };
+            taken += u32::from(is_taken);
+            longest = longest.max(taken_here);
+        }
+    }
+    // As long as what a search finds is on probation. Where what lies beyond the border is compared
+    // too, it is up to 118.
+    assert!(longest <= 15, "taken for {longest} images, in all for {taken}");
+}
