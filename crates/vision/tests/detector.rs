@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
+use std::collections::BTreeSet;
+
 use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
 use crossfix_vision::{DetectorConfig, ImageTrack, ImageTracker, TrackPhase, TrackerConfig};
@@ -223,28 +225,35 @@ fn scenes_without_targets_give_no_more_false_tracks_than_asked() {
     assert!(false_tracks.len() <= 2, "{false_tracks:?}");
 }
 
+/// A landscape before a camera that every image finds up to `REACH` half px off on either axis.
+fn shaken<const REACH: u32>(x: f64, y: f64, time_s: f64) -> f64 {
+    let reach = f64::from(REACH) / 2.0;
+    let mut rng = ChaCha8Rng::seed_from_u64((time_s * RATE_HZ).round() as u64);
+    let [by, down]: [f64; 2] = std::array::from_fn(|_| rng.random_range(-reach..reach));
+    landscape(x + by, y + down, time_s)
+}
+
 #[test]
 fn a_shaken_camera_finds_what_comes_and_nothing_else() {
-    fn shaken(x: f64, y: f64, time_s: f64) -> f64 {
-        let mut rng = ChaCha8Rng::seed_from_u64((time_s * RATE_HZ).round() as u64);
-        let [by, down]: [f64; 2] = std::array::from_fn(|_| rng.random_range(-0.5..0.5));
-        landscape(x + by, y + down, time_s)
+    // A gust moves a mast's camera by several px from one image to the next.
+    let scenes: [Scene; 2] = [shaken::<1>, shaken::<6>];
+    for scene in scenes {
+        let mut world = World::new(240, 200, 3.0, scene, 20);
+        let spot = |time_s: f64| Spot {
+            x: 30.0 + 60.0 * (time_s - 3.0),
+            y: 50.0,
+            spread: [4.0, 2.5],
+            brighter: 100.0,
+        };
+        let mut seen = 0;
+        watch(&mut world, 5.0, from(3.0, spot), |time_s, tracks| {
+            assert!(time_s >= 3.0 || tracks.is_empty(), "at {time_s}: {tracks:?}");
+            let is_there = tracks.iter().all(|track| is_at(track, &spot(time_s), 8.0));
+            assert!(is_there, "at {time_s}: {tracks:?}");
+            seen += usize::from(time_s >= 3.5 && !tracks.is_empty());
+        });
+        assert!(seen >= 44, "in {seen} of 45 images");
     }
-    let mut world = World::new(240, 200, 3.0, shaken, 20);
-    let spot = |time_s: f64| Spot {
-        x: 30.0 + 60.0 * (time_s - 3.0),
-        y: 50.0,
-        spread: [4.0, 2.5],
-        brighter: 100.0,
-    };
-    let mut seen = 0;
-    watch(&mut world, 5.0, from(3.0, spot), |time_s, tracks| {
-        assert!(time_s >= 3.0 || tracks.is_empty(), "at {time_s}: {tracks:?}");
-        let is_there = tracks.iter().all(|track| is_at(track, &spot(time_s), 8.0));
-        assert!(is_there, "at {time_s}: {tracks:?}");
-        seen += usize::from(time_s >= 3.5 && !tracks.is_empty());
-    });
-    assert!(seen >= 44, "in {seen} of 45 images");
 }
 
 #[test]
@@ -300,22 +309,35 @@ fn what_comes_into_view_as_the_camera_is_raised_is_not_found() {
     }
 }
 
-/// A reticle of lines, written over the picture.
-fn with_reticle(mut image: Plane) -> Plane {
+/// A reticle of lines, written over the picture: bright, or such that it stands out of what is
+/// behind it.
+fn with_reticle(mut image: Plane, stands_out: bool) -> Plane {
+    let write = |sample: &mut f32| {
+        *sample = if stands_out && *sample > 128.0 { 0.0 } else { 250.0 };
+    };
     for y in (40..80).chain(160..200) {
         for x in [60, 61, 258, 259] {
-            image.row_mut(y)[x] = 250.0;
+            write(&mut image.row_mut(y)[x]);
         }
     }
     for y in [119, 120] {
-        image.row_mut(y)[20..60].fill(250.0);
-        image.row_mut(y)[260..300].fill(250.0);
+        image.row_mut(y)[20..60].iter_mut().for_each(write);
+        image.row_mut(y)[260..300].iter_mut().for_each(write);
     }
     image
 }
 
 #[test]
 fn what_is_written_over_the_picture_is_not_found_when_the_camera_turns() {
+    assert_eq!(found_of_reticle(false), 0);
+    // Two of its lines are when they first turn dark; before their size was known whatever their
+    // brightness, 18 to 31 in four worlds.
+    let found = found_of_reticle(true);
+    assert!(found <= 3, "{found} parts of it");
+}
+
+/// How many tracks are begun on a reticle while the camera turns behind it.
+fn found_of_reticle(stands_out: bool) -> usize {
     fn turning(x: f64, y: f64, time_s: f64) -> f64 {
         let turned = 40.0 * (time_s - 1.0).max(0.0);
         clouds(x + turned, y, 0.0) + 20.0 * ((x + turned) * 0.4).sin() * (y * 0.5).cos()
@@ -327,16 +349,18 @@ fn what_is_written_over_the_picture_is_not_found_when_the_camera_turns() {
         spread: [4.0, 3.0],
         brighter: 100.0,
     };
-    let (mut tracker, mut seen) = (tracker(), 0);
+    let (mut tracker, mut seen, mut elsewhere) = (tracker(), 0, BTreeSet::new());
     for frame in 0..180 {
         let time_s = f64::from(frame) / RATE_HZ;
-        let image = with_reticle(world.image(time_s, &from(2.0, spot)(time_s)));
+        let image = with_reticle(world.image(time_s, &from(2.0, spot)(time_s)), stands_out);
         let tracks = tracker.step(&image, Timestamp::from_seconds(time_s));
-        let is_there = tracks.iter().all(|track| is_at(track, &spot(time_s), 12.0));
-        assert!(is_there, "at {time_s}: {tracks:?}");
-        seen += usize::from(time_s >= 3.0 && !tracks.is_empty());
+        let on_it = tracks.iter().filter(|track| is_at(track, &spot(time_s), 12.0)).count();
+        seen += usize::from(time_s >= 3.0 && on_it > 0);
+        let off_it = tracks.iter().filter(|track| !is_at(track, &spot(time_s), 12.0));
+        elsewhere.extend(off_it.map(|track| track.id.0));
     }
     assert!(seen >= 85, "in {seen} of 90 images");
+    elsewhere.len()
 }
 
 /// A mount has turned the camera: the target is another place of another scene, and what was

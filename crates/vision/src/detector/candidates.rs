@@ -399,11 +399,6 @@ impl Candidates {
         }
     }
 
-    /// Forgets all candidates, and keeps what is known of chance.
-    pub(super) fn clear(&mut self) {
-        self.list.clear();
-    }
-
     /// Removes the candidates of which a condition is true, and returns them.
     pub(super) fn take_if(&mut self, is_wanted: impl Fn(&Candidate) -> bool) -> Vec<Candidate> {
         self.list.extract_if(.., |candidate| is_wanted(candidate)).collect()

@@ -5,6 +5,7 @@ use crossfix_correlation::Plane;
 
 use super::cell_update::{BackgroundRow, CellUpdate, OUTLYING, slope_squared};
 use super::filter::{SURROUNDINGS, StandOutScratch, between, moved, resample, stand_out};
+use super::lens::OnLens;
 use crate::noise::{OF_MEDIAN, median};
 
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a
@@ -54,19 +55,6 @@ const CONTRAST_SPREADS: f32 = 4.0;
 /// Range of the contrast: beyond it is another scene, or none. With half of the range a step of the
 /// exposure by two changes every edge.
 const CONTRASTS: [f32; 2] = [0.5, 2.0];
-
-/// What stands out is on the lens if the mean of what has kept its place in the image lacks less of
-/// it than this share of what the background lacks. With half of it lines behind which the scene
-/// changes are found; with twice as much a target that a turning camera keeps nearly in its place
-/// is refused.
-const LENS: f32 = 0.35;
-/// What keeps its place in the image is a mean over this way of the scene, px, about as long as its
-/// texture: the scene averages out of it. With four times as much what passes behind a reticle is
-/// found.
-const LENS_PX: f64 = 10.0;
-/// ... and over this time at least, s. With half of it a target that a camera follows is on the
-/// lens before it is found.
-const LENS_S: f64 = 0.25;
 
 /// Time and camera direction of an image, for the background.
 #[derive(Clone, Copy, Debug)]
@@ -120,8 +108,7 @@ pub(super) struct Level {
     /// Mean and variance of `now` over the last seconds.
     mean: Plane,
     variance: Plane,
-    /// Mean of `stands_out`: what keeps its place in the image, however the camera turns.
-    on_lens: Plane,
+    on_lens: OnLens,
     /// Change of this image from the mean, standard deviations; 0 where a known target is.
     pub(super) change: Plane,
     /// Shift of the background against the image, cells: the whole ones, and the rest.
@@ -155,7 +142,7 @@ impl Level {
             now: Plane::default(),
             mean: Plane::default(),
             variance: Plane::default(),
-            on_lens: Plane::default(),
+            on_lens: OnLens::default(),
             change: Plane::default(),
             whole: [0; 2],
             rest: [0.0; 2],
@@ -173,11 +160,6 @@ impl Level {
     /// Side of a cell, px.
     pub(super) fn cell(&self) -> usize {
         self.cell
-    }
-
-    /// Whether enough of the scene has texture to show its sway.
-    pub(super) fn is_textured(&self) -> bool {
-        self.is_textured
     }
 
     /// Sway of what has texture, px (root mean square).
@@ -222,12 +204,10 @@ impl Level {
             return false;
         }
         let now = self.now.row(y)[x];
+        let excess = now - self.contrast * self.mean.row(y)[x];
         // The background's cell (x, y) lies at (x, y) - rest in the image's cells.
         let at = [x as f32 - self.rest[0], y as f32 - self.rest[1]].map(f64::from);
-        let of_lens = between(&self.on_lens, at);
-        let excess = now - self.contrast * self.mean.row(y)[x];
-        // It hides the scene, or is in the surroundings of what stands out beside it.
-        (now - of_lens).abs().min((excess - of_lens).abs()) < LENS * excess.abs()
+        self.on_lens.explains(at, now, excess)
     }
 
     /// Least strength of something that is not noise, in spreads.
@@ -257,7 +237,7 @@ impl Level {
     /// Takes in the image in `reduced`, and learns it except where `known` covers it.
     pub(super) fn see(&mut self, moment: Moment, known: &[Cells]) {
         stand_out(&self.reduced, &mut self.stands_out, &mut self.stand_out_scratch);
-        self.learn_lens(moment, known);
+        self.on_lens.learn(&self.stands_out, moment, known);
         self.turn(moment);
         if moment.is_first {
             self.mean.copy_from(&self.now);
@@ -269,26 +249,6 @@ impl Level {
         }
         self.learn(moment.share, known);
         self.remember_changes();
-    }
-
-    /// Takes the image into the mean of what keeps its place in it, except where `known` covers it:
-    /// in the background's cells, which lie within a cell of the image's. Known targets are painted
-    /// over, so that their edges are as empty as they.
-    fn learn_lens(&mut self, moment: Moment, known: &[Cells]) {
-        let Moment { share, is_first, turning_px_s, interval, .. } = moment;
-        let passed = (turning_px_s * interval / LENS_PX).min(interval / LENS_S);
-        let share = share.max(1.0 - (-passed).exp() as f32);
-        if is_first {
-            self.on_lens.copy_from(&self.stands_out);
-        }
-        let (width, height) = (self.on_lens.width(), self.on_lens.height());
-        for y in 0..height {
-            let (mean, now) = (self.on_lens.row_mut(y), self.stands_out.row(y));
-            for [from, to] in free_of(known, y, width) {
-                let cells = mean[from..to].iter_mut().zip(&now[from..to]);
-                cells.for_each(|(mean, now)| *mean += share * (now - *mean));
-            }
-        }
     }
 
     /// Moves the background with the scene.
@@ -445,7 +405,7 @@ fn sampling_step(cells: usize) -> usize {
 }
 
 /// The parts of a row that no known target covers.
-fn free_of(known: &[Cells], row: usize, width: usize) -> Vec<[usize; 2]> {
+pub(super) fn free_of(known: &[Cells], row: usize, width: usize) -> Vec<[usize; 2]> {
     let in_row = known.iter().filter(|cells| (cells.rows[0]..cells.rows[1]).contains(&row));
     let mut covered: Vec<[usize; 2]> = in_row.map(|cells| cells.columns).collect();
     covered.sort_unstable();

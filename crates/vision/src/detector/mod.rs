@@ -19,6 +19,7 @@ mod candidates;
 mod cell_update;
 mod common_motion;
 mod filter;
+mod lens;
 mod level;
 mod outline;
 mod plots;
@@ -105,16 +106,10 @@ const NEW_S: f64 = 0.5;
 /// of 20 px makes all that is in view move at 200 px/s instead of 100.
 const TURN_S: f64 = 0.2;
 
-/// While a scene with texture turns faster than this, px/s, nothing is found, and for [`WARM_UP_S`]
-/// afterwards: a pixel's error of its registration changes every edge. With no such limit 76 tracks
-/// are begun on what a thermal head turns over in 17 s, instead of 6; with half of it hardly
-/// anything is found where a head follows a target (reasoned, not measured).
+/// A turn faster than this, px/s, counts for [`PARALLAX`]: in slower ones what is near has not gone
+/// far before it is known. With half of it what drifts in a slow pan is found later (reasoned, not
+/// measured).
 const FAST_TURN_PX_S: f64 = 120.0;
-
-/// Most by which the registration of a scene that stands still jumps in one image, px: the noise of
-/// a bare scene moves it by a pixel or two, and 20 px/s that are registered every 0.1 s are two.
-/// With half of it such a jump counts as a fast turn at more than 30 images per second.
-const CORRECTION_PX: f64 = 4.0;
 
 /// A target that is followed already.
 #[derive(Clone, Copy, Debug)]
@@ -163,8 +158,7 @@ pub(crate) struct Detector {
     sides: [usize; 2],
     levels: Vec<Level>,
     images: u32,
-    /// How long the background has been learnt since another scene was in view or the scene turned
-    /// fast, s.
+    /// How long the background has been learnt since another scene was in view, s.
     settled_s: f64,
     /// Whether that has been long enough once since it was begun, ...
     has_warmed: bool,
@@ -219,7 +213,6 @@ impl Detector {
         let Some(finest) = self.levels.first_mut() else { return Findings::default() };
         halve(image, &mut finest.reduced);
         replace_invalid(&mut finest.reduced);
-        let moved_px = (turned[0] - self.turned[0]).hypot(turned[1] - self.turned[1]);
         self.note_motion(interval, turned, known);
         // How much the known targets stand out is measured before they are painted over.
         self.watch(known);
@@ -237,11 +230,6 @@ impl Detector {
         }
         if self.images > 1 {
             self.settled_s += interval;
-        }
-        if self.levels[0].is_textured() && self.turns_fast(moved_px, interval) {
-            self.settled_s = 0.0;
-            // Their next plots would come after a gap, and from elsewhere.
-            self.candidates.clear();
         }
         let scene = self.take_scene(interval);
         let is_warm = self.settled_s >= WARM_UP_S && self.images > WARM_UP_IMAGES;
@@ -366,13 +354,6 @@ impl Detector {
                 None => self.found_targets.push(FoundTarget::new(known.id, place)),
             }
         }
-    }
-
-    /// Whether the scene turns fast, by how far it has moved since the last image: at once where
-    /// that is more than the registration may be corrected by, else in the mean.
-    fn turns_fast(&self, moved_px: f64, interval: f64) -> bool {
-        let at_once = (FAST_TURN_PX_S * interval).max(CORRECTION_PX);
-        moved_px > at_once || self.turning_px_s() > FAST_TURN_PX_S
     }
 
     /// How fast the scene turns, in the mean, px/s.
