@@ -258,7 +258,7 @@ impl ImageTracker {
             velocity_sd: None,
         });
         let known: Vec<KnownTarget> = known.chain(given).collect();
-        let findings = detector.step(image, interval, self.scene.shifted(), &known);
+        let findings = detector.step(image, interval, turned, &known);
         self.followed.retain(|followed| !findings.scene.contains(&followed.id));
         self.tracks.retain(|track| !findings.scene.contains(&track.id));
         findings.found

@@ -108,8 +108,6 @@ pub(crate) struct SceneMemory {
     glance: RowGlance,
     /// Where what was in the newest picture was at the beginning.
     turned: SceneTurn,
-    /// By how much the middle of the image has moved since the beginning, px.
-    shifted: [f64; 2],
     /// Whether no picture is registered, as if the camera never turned.
     is_unregistered: bool,
 }
@@ -134,12 +132,6 @@ impl SceneMemory {
     pub(crate) fn turned(&self) -> SceneTurn {
         let newest = self.pictures.first().map_or(SceneTurn::none(), |newest| newest.turn);
         newest.and_then(self.turned)
-    }
-
-    /// The sum of all shifts since the beginning: what is in the middle of an image was farther by
-    /// this, px, but for roll and zoom.
-    pub(crate) fn shifted(&self) -> [f64; 2] {
-        self.shifted
     }
 
     /// Forgets all pictures.
@@ -189,8 +181,6 @@ impl SceneMemory {
         for picture in &mut self.pictures {
             picture.turn = step.and_then(picture.turn);
         }
-        let [right, down] = step.moves(middle(image));
-        self.shifted = [self.shifted[0] + right, self.shifted[1] + down];
         if found.is_significant && farthest_moved(step, image) >= STILL_PX {
             self.turning_s = TURNS_ON_S;
         }
@@ -315,12 +305,6 @@ fn farthest_moved(turn: SceneTurn, image: &Plane) -> f64 {
     let places = [[0.0, 0.0], [right, 0.0], [0.0, down], [right, down], [right / 2.0, down / 2.0]];
     let moved = places.map(|[x, y]| turn.moves(ImagePoint { x, y }));
     moved.iter().map(|[right, down]| right.hypot(*down)).fold(0.0, f64::max)
-}
-
-/// The middle of an image.
-fn middle(image: &Plane) -> ImagePoint {
-    let [x, y] = [image.width(), image.height()].map(|side| (side as f64 - 1.0) / 2.0);
-    ImagePoint { x, y }
 }
 
 #[cfg(test)]

@@ -256,6 +256,36 @@ fn a_shaken_camera_finds_what_comes_and_nothing_else() {
     }
 }
 
+/// Clouds and trees before a camera that rolls, or zooms, by as much in a second.
+fn bent(x: f64, y: f64, roll_rad: f64, zoom: f64) -> f64 {
+    let ((sin, cos), [right, down]) = (roll_rad.sin_cos(), [x - 160.0, y - 120.0]);
+    let x = 160.0 + (cos * right - sin * down) / zoom;
+    let y = 120.0 + (sin * right + cos * down) / zoom;
+    clouds(x, y, 0.0) + if y > 150.0 { 20.0 * (x * 0.4).sin() * (y * 0.5).cos() } else { 0.0 }
+}
+
+#[test]
+fn a_camera_that_rolls_or_zooms_finds_what_comes_and_nothing_else() {
+    let rolls: Scene = |x, y, time_s| bent(x, y, 0.2 * (1.5 * time_s).sin(), 1.0);
+    let zooms: Scene = |x, y, time_s| bent(x, y, 0.0, 1.0 + 0.2 * (1.5 * time_s).sin());
+    for scene in [rolls, zooms] {
+        let mut world = World::new(320, 240, 2.0, scene, 24);
+        let spot = |time_s: f64| Spot {
+            x: 60.0 + 50.0 * (time_s - 3.0),
+            y: 80.0,
+            spread: [4.0, 3.0],
+            brighter: 100.0,
+        };
+        let mut seen = 0;
+        watch(&mut world, 6.0, from(3.0, spot), |time_s, tracks| {
+            let is_there = tracks.iter().all(|track| is_at(track, &spot(time_s), 12.0));
+            assert!(is_there, "at {time_s}: {tracks:?}");
+            seen += usize::from(time_s >= 4.0 && !tracks.is_empty());
+        });
+        assert!(seen >= 55, "in {seen} of 60 images");
+    }
+}
+
 #[test]
 fn a_camera_that_turns_away_finds_nothing_in_the_turn_and_the_target_after_it() {
     fn turning(x: f64, y: f64, time_s: f64) -> f64 {

@@ -154,7 +154,8 @@ pub(super) struct Candidate {
 }
 
 impl Candidate {
-    fn new(plot: Plot, place: [f64; 2]) -> Self {
+    fn new(plot: Plot) -> Self {
+        let place = plot.in_scene;
         let first = place.map(|position| AxisMeasurement { position, variance: plot.variance() });
         let TargetModel { velocity_sd_px, acceleration_sd_px, .. } = TARGET;
         Self {
@@ -210,10 +211,10 @@ impl Candidate {
                 .min(STRENGTH.most)
     }
 
-    fn innovation(&self, plot: &Plot, place: [f64; 2]) -> PlotInnovation {
+    fn innovation(&self, plot: &Plot) -> PlotInnovation {
         let variance = plot.variance();
         let mut both = PlotInnovation { squared: 0.0, determinant: 1.0 };
-        for (axis, position) in self.axes.iter().zip(place) {
+        for (axis, position) in self.axes.iter().zip(plot.in_scene) {
             let innovation = axis.innovation(AxisMeasurement { position, variance });
             both.squared += innovation.normalised_squared();
             both.determinant *= axis.position_variance() + variance;
@@ -227,8 +228,8 @@ impl Candidate {
     }
 
     /// Updates with a plot; `clutter` is the density of clutter there, 1/px^2.
-    fn take(&mut self, plot: Plot, place: [f64; 2], innovation: PlotInnovation, clutter: f64) {
-        for (axis, position) in self.axes.iter_mut().zip(place) {
+    fn take(&mut self, plot: Plot, innovation: PlotInnovation, clutter: f64) {
+        for (axis, position) in self.axes.iter_mut().zip(plot.in_scene) {
             axis.measurement_update(AxisMeasurement { position, variance: plot.variance() });
         }
         let off = [0, 1].map(|i| self.axes[i].position() - self.first[i]);
@@ -329,19 +330,16 @@ impl Candidates {
     }
 
     /// Associates the plots of the next image: each candidate takes the nearest free plot in its
-    /// gate, and the plots that are left begin candidates and count as clutter. `turned` is by how
-    /// much the scene has moved since the first image, px, and `turned_fast_px` how far it has
-    /// turned since the image before if it turns fast.
+    /// gate, and the plots that are left begin candidates and count as clutter. `turned_fast_px` is
+    /// how far the scene has turned since the image before if it turns fast.
     pub(super) fn step(
         &mut self,
         plots: &[Plot],
-        turned: [f64; 2],
         turned_fast_px: f64,
         interval: f64,
         sides: [usize; 2],
     ) {
         self.clutter.fit(sides);
-        let in_scene = |plot: &Plot| [plot.place.x + turned[0], plot.place.y + turned[1]];
         let gate = Gate::with_probability(TARGET.in_gate);
         let mut is_free = vec![true; plots.len()];
         // The likeliest candidates choose first: the list is sorted.
@@ -352,15 +350,14 @@ impl Candidates {
                 .iter()
                 .enumerate()
                 .filter(|(index, plot)| is_free[*index] && candidate.may_make(plot));
-            let innovations =
-                near.map(|(index, plot)| (index, candidate.innovation(plot, in_scene(plot))));
+            let innovations = near.map(|(index, plot)| (index, candidate.innovation(plot)));
             let in_gate = innovations.filter(|(_, innovation)| gate.holds(innovation.squared));
             match in_gate.min_by(|(_, one), (_, other)| one.squared.total_cmp(&other.squared)) {
                 Some((index, innovation)) => {
                     is_free[index] = false;
                     let plot = plots[index];
                     let clutter = self.clutter.density(plot.place);
-                    candidate.take(plot, in_scene(&plot), innovation, clutter);
+                    candidate.take(plot, innovation, clutter);
                 }
                 None => {
                     // ln (1 - P_D).
@@ -375,7 +372,7 @@ impl Candidates {
         for (plot, _) in plots.iter().zip(is_free).filter(|(_, is_free)| *is_free) {
             let cell = self.clutter.cell(plot.place);
             self.clutter.counts[cell] += 1.0;
-            self.list.push(Candidate::new(*plot, in_scene(plot)));
+            self.list.push(Candidate::new(*plot));
         }
         self.clutter.learn(interval);
         self.list.sort_by(|one, other| other.log_ratio().total_cmp(&one.log_ratio()));

@@ -6,7 +6,10 @@ use crossfix_correlation::Plane;
 use super::cell_update::{BackgroundRow, CellUpdate, OUTLYING, slope_squared};
 use super::filter::{SURROUNDINGS, StandOutScratch, between, moved, resample, stand_out};
 use super::lens::OnLens;
+use super::straight::Straightening;
+use crate::ImagePoint;
 use crate::noise::{OF_MEDIAN, median};
+use crate::scene_turn::SceneTurn;
 
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a
 /// level, and with half of it each such step is two standard deviations.
@@ -59,9 +62,8 @@ const CONTRASTS: [f32; 2] = [0.5, 2.0];
 /// Time and camera direction of an image, for the background.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Moment {
-    /// By how much the scene has moved since the first image, px: what is at (x, y) was at (x, y)
-    /// plus this.
-    pub(super) turned: [f64; 2],
+    /// How the image lies against the first one.
+    pub(super) view: Straightening,
     /// How fast it turns, in the mean, px/s.
     pub(super) turning_px_s: f64,
     /// Time since the image before, s.
@@ -99,8 +101,9 @@ fn is_near(at: usize, [from, to]: [usize; 2]) -> bool {
 pub(super) struct Level {
     /// Side of a cell, px.
     cell: usize,
-    /// The image's means over the cells.
+    /// The image's means over the cells, and those of the straightened image, if it is another.
     pub(super) reduced: Plane,
+    pub(super) straight: Plane,
     stands_out: Plane,
     stand_out_scratch: StandOutScratch,
     /// By how much the background's cells stand out in this image, levels.
@@ -111,7 +114,10 @@ pub(super) struct Level {
     on_lens: OnLens,
     /// Change of this image from the mean, standard deviations; 0 where a known target is.
     pub(super) change: Plane,
-    /// Shift of the background against the image, cells: the whole ones, and the rest.
+    /// How this image lies against the first one.
+    view: Straightening,
+    /// Shift of the background against the straightened image, cells: the whole ones, and the
+    /// rest.
     whole: [isize; 2],
     rest: [f32; 2],
     /// Contrast of the background in this image, as a multiple of that in the mean.
@@ -137,6 +143,8 @@ impl Level {
         Self {
             cell,
             reduced: Plane::default(),
+            straight: Plane::default(),
+            view: Straightening::new(SceneTurn::none(), [0; 2]),
             stands_out: Plane::default(),
             stand_out_scratch: StandOutScratch::default(),
             now: Plane::default(),
@@ -172,20 +180,34 @@ impl Level {
         self.is_lost
     }
 
-    /// Where the middle of a background's cell is in the image, px.
-    pub(super) fn place_of(&self, cell: [f64; 2]) -> [f64; 2] {
+    /// Where the middle of a background's cell is in the image, px, and where that was in the first
+    /// one.
+    pub(super) fn place_of(&self, cell: [f64; 2]) -> (ImagePoint, [f64; 2]) {
         let side = self.cell as f64;
-        [0, 1].map(|i| (cell[i] - f64::from(self.rest[i]) + 0.5) * side - 0.5)
+        let [x, y] = [0, 1].map(|i| (cell[i] - f64::from(self.rest[i]) + 0.5) * side - 0.5);
+        let straight = ImagePoint { x, y };
+        (self.view.in_image(straight), self.view.in_scene(straight))
     }
 
-    /// A place of the image in the background's cells, whose middles are the whole numbers.
-    pub(super) fn cell_of(&self, place: [f64; 2]) -> [f64; 2] {
+    /// A place of the straightened image in the background's cells, whose middles are the whole
+    /// numbers.
+    fn cell_of(&self, ImagePoint { x, y }: ImagePoint) -> [f64; 2] {
+        let place = [x, y];
         [0, 1].map(|i| (place[i] + 0.5) / self.cell as f64 - 0.5 + f64::from(self.rest[i]))
     }
 
+    /// The background's cells in which what has its corners at these places of the straightened
+    /// image is.
+    pub(super) fn cells_between(&self, corners: [ImagePoint; 2]) -> Cells {
+        let [first, last] = corners.map(|corner| self.cell_of(corner).map(f64::round));
+        let range =
+            |axis: usize| [first[axis].max(0.0) as usize, (last[axis] + 1.0).max(0.0) as usize];
+        Cells { columns: range(0), rows: range(1) }
+    }
+
     /// By how much the background is expected to stand out at a place of this image, levels.
-    pub(super) fn background(&self, place: [f64; 2]) -> f32 {
-        self.contrast * between(&self.mean, self.cell_of(place))
+    pub(super) fn background(&self, place: ImagePoint) -> f32 {
+        self.contrast * between(&self.mean, self.cell_of(self.view.straight(place)))
     }
 
     /// Share of what stands out at a cell that is new: 1 if the background has nothing there, 0 if
@@ -200,13 +222,13 @@ impl Level {
     /// its place in the image explains it, and the background does not. False while the camera has
     /// not turned: the two are the same then, but for the light and the limit on outliers.
     pub(super) fn is_on_lens(&self, [x, y]: [usize; 2]) -> bool {
-        if (self.whole, self.rest) == ([0; 2], [0.0; 2]) {
+        if (self.whole, self.rest) == ([0; 2], [0.0; 2]) && self.view.is_none() {
             return false;
         }
         let now = self.now.row(y)[x];
         let excess = now - self.contrast * self.mean.row(y)[x];
-        // The background's cell (x, y) lies at (x, y) - rest in the image's cells.
-        let at = [x as f32 - self.rest[0], y as f32 - self.rest[1]].map(f64::from);
+        let (place, _) = self.place_of([x, y].map(|at| at as f64));
+        let at = [place.x, place.y].map(|at| (at + 0.5) / self.cell as f64 - 0.5);
         self.on_lens.explains(at, now, excess)
     }
 
@@ -234,10 +256,15 @@ impl Level {
         OF_MEDIAN * median(&mut self.scratch) / self.spread
     }
 
-    /// Takes in the image in `reduced`, and learns it except where `known` covers it.
-    pub(super) fn see(&mut self, moment: Moment, known: &[Cells]) {
+    /// Takes in the image in `reduced` and `straight`, and learns it except where `known` covers it,
+    /// and in the image itself `known_in_image`.
+    pub(super) fn see(&mut self, moment: Moment, known: &[Cells], known_in_image: &[Cells]) {
+        self.view = moment.view;
         stand_out(&self.reduced, &mut self.stands_out, &mut self.stand_out_scratch);
-        self.on_lens.learn(&self.stands_out, moment, known);
+        self.on_lens.learn(&self.stands_out, moment, known_in_image);
+        if !self.view.is_none() {
+            stand_out(&self.straight, &mut self.stands_out, &mut self.stand_out_scratch);
+        }
         self.turn(moment);
         if moment.is_first {
             self.mean.copy_from(&self.now);
@@ -252,8 +279,8 @@ impl Level {
     }
 
     /// Moves the background with the scene.
-    fn turn(&mut self, Moment { turned, is_first, .. }: Moment) {
-        let cells = turned.map(|turned| turned / self.cell as f64);
+    fn turn(&mut self, Moment { view, is_first, .. }: Moment) {
+        let cells = view.shift().map(|shift| shift / self.cell as f64);
         // The background moves by whole cells: interpolated at every turn it would be blurred more
         // and more. The image is interpolated instead, by the rest, and only once.
         let whole = cells.map(|cells| cells.round() as isize);
@@ -311,7 +338,8 @@ impl Level {
         let mean = self.mean.samples();
         let noise = self.spread * self.spread;
         for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
-            if i % width == 0 || i % width == width - 1 {
+            if i % width == 0 || i % width == width - 1 || !self.is_in_view([i % width, i / width])
+            {
                 continue;
             }
             let slope =
@@ -348,6 +376,11 @@ impl Level {
             self.is_textured && (sways_too_far || changed as f32 > MOST_CHANGED * textured as f32);
     }
 
+    /// Whether a background's cell is in view.
+    fn is_in_view(&self, [x, y]: [usize; 2]) -> bool {
+        self.view.cells_in_view(y, self.now.width(), self.cell).contains(&x)
+    }
+
     /// Converts the changes to standard deviations, and learns the background.
     fn learn(&mut self, share: f32, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
@@ -364,7 +397,12 @@ impl Level {
             update.textures(above, self.mean.row(y), below, &mut self.scratch);
             let change = self.change.row_mut(y);
             change.fill(0.0);
+            let in_view = self.view.cells_in_view(y, width, self.cell);
             for [from, to] in free_of(known, y, width) {
+                let (from, to) = (from.max(in_view.start), to.min(in_view.end));
+                if from >= to {
+                    continue;
+                }
                 update.learn(BackgroundRow {
                     now: &self.now.row(y)[from..to],
                     textures: &self.scratch[from..to],
@@ -446,9 +484,9 @@ mod tests {
             // Sky above: there nothing sways.
             if down < 72.0 { 0.0 } else { waves as f32 }
         });
-        let moment =
-            Moment { turned, turning_px_s: 0.0, interval: 1.0 / 30.0, share: 0.1, is_first };
-        level.see(moment, &[]);
+        let view = Straightening::new(SceneTurn::shift(turned), [80, 60].map(|n| n * level.cell()));
+        let moment = Moment { view, turning_px_s: 0.0, interval: 1.0 / 30.0, share: 0.1, is_first };
+        level.see(moment, &[], &[]);
     }
 
     fn greatest_change(level: &Level) -> f32 {

@@ -23,16 +23,21 @@ mod lens;
 mod level;
 mod outline;
 mod plots;
+mod straight;
 
-use crossfix_correlation::Plane;
+use std::collections::VecDeque;
+
+use crossfix_correlation::{Plane, Resampler};
 
 use crate::crop::{paint_over, replace_invalid};
+use crate::scene_turn::SceneTurn;
 use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
 use common_motion::{CommonMotion, FoundTarget};
 use filter::{StandOutScratch, between, halve, stand_out};
 use level::{Cells, Level, Moment};
 use plots::Plot;
+use straight::Straightening;
 
 /// Sides of the cells of the scales, px: what is found is two or three cells large, 4 to 48 px.
 /// With half of each, what is larger than 24 px makes plots at its edges only.
@@ -106,6 +111,17 @@ const NEW_S: f64 = 0.5;
 /// of 20 px makes all that is in view move at 200 px/s instead of 100.
 const TURN_S: f64 = 0.2;
 
+/// Most roll (rad) and zoom (a share) of an image against that in which the background was begun:
+/// corners are out of view by then, and what is zoomed is blurred. With half of it a camera that
+/// zooms to twice the size begins six times anew, and finds nothing for a quarter of a second each
+/// time.
+const MOST_BENT: f64 = 0.25;
+
+/// What has come into view less than this ago is not found, s: twice the warm-up, so that a
+/// candidate is begun by what is seen whole. With half of it what comes into a panning camera's
+/// view is found (reasoned, not measured).
+const COMES_S: f64 = 2.0 * WARM_UP_S;
+
 /// A turn faster than this, px/s, counts for [`PARALLAX`]: in slower ones what is near has not gone
 /// far before it is known. With half of it what drifts in a slow pan is found later (reasoned, not
 /// measured).
@@ -144,7 +160,7 @@ struct SceneSuspect {
     id: ImageTrackId,
     /// Index of the scale that fits its size.
     level: usize,
-    place: [f64; 2],
+    place: ImagePoint,
     /// By how much it stands out in this image, levels.
     stands_out: f32,
     /// Running share of the images in which it was new.
@@ -166,9 +182,16 @@ pub(crate) struct Detector {
     lost_s: f64,
     plots: Vec<Plot>,
     candidates: Candidates,
-    /// `turned` of the last image, px, and a running mean of its change, px/s.
-    turned: [f64; 2],
+    /// Where what was in the image in which the background was begun, and in the last one, was at
+    /// the beginning.
+    begun: SceneTurn,
+    last: SceneTurn,
+    /// A running mean of how fast the middle of the image turns, px/s.
     turning: [f64; 2],
+    /// How the images of the last [`COMES_S`] lie against the one in which the background was
+    /// begun, and their ages, s.
+    views: VecDeque<(f64, Straightening)>,
+    resampler: Resampler,
     /// How long most of what moves has moved alike, s.
     alike_s: f64,
     found_targets: Vec<FoundTarget>,
@@ -187,21 +210,24 @@ impl Detector {
             lost_s: 0.0,
             plots: Vec::new(),
             candidates: Candidates::default(),
-            turned: [0.0; 2],
+            begun: SceneTurn::none(),
+            last: SceneTurn::none(),
             turning: [0.0; 2],
+            views: VecDeque::new(),
+            resampler: Resampler::default(),
             alike_s: 0.0,
             found_targets: Vec::new(),
             watches: Vec::new(),
         }
     }
 
-    /// Takes the next image, `interval` seconds after the last one. `turned` is by how much the
-    /// scene has moved since the first one: what is at (x, y) was at (x, y) plus this, px.
+    /// Takes the next image, `interval` seconds after the last one. `turned` is where what is in it
+    /// was at the beginning.
     pub(crate) fn step(
         &mut self,
         image: &Plane,
         interval: f64,
-        turned: [f64; 2],
+        turned: SceneTurn,
         known: &[KnownTarget],
     ) -> Findings {
         if self.sides != [image.width(), image.height()] {
@@ -210,16 +236,17 @@ impl Detector {
             let fits = |cell: &&usize| self.sides.iter().all(|side| side / **cell >= LEAST_CELLS);
             self.levels = CELLS.iter().take_while(fits).map(|cell| Level::new(*cell)).collect();
         }
+        self.note_motion(interval, turned, known);
+        let view = self.note_view(interval, turned);
         let Some(finest) = self.levels.first_mut() else { return Findings::default() };
         halve(image, &mut finest.reduced);
         replace_invalid(&mut finest.reduced);
-        self.note_motion(interval, turned, known);
         // How much the known targets stand out is measured before they are painted over.
         self.watch(known);
         for known in known {
             cover(&mut self.levels[0].reduced, &known.place);
         }
-        self.learn(interval, turned, known);
+        self.learn(interval, view, known);
         if self.levels[0].has_lost_scene() {
             self.settled_s = 0.0;
             self.lost_s += interval;
@@ -236,7 +263,7 @@ impl Detector {
         self.has_warmed |= is_warm;
         let mut findings = Findings { found: Vec::new(), scene };
         if is_warm {
-            self.plot(interval, turned, known);
+            self.plot(interval, known);
             findings.scene.extend(self.take_common_motion(interval));
             findings.found = self.find(image, known);
         }
@@ -265,8 +292,7 @@ impl Detector {
             let nearest = (0..self.levels.len())
                 .min_by(|one, other| off(&self.levels[*one]).total_cmp(&off(&self.levels[*other])));
             let Some(level) = nearest else { return };
-            let centre = known.place.centre();
-            let place = [centre.x, centre.y];
+            let place = known.place.centre();
             let stands_out =
                 stands_out_at(&self.levels[0].reduced, level, self.levels[level].cell(), place);
             match self.watches.iter_mut().find(|watch| watch.id == known.id) {
@@ -285,21 +311,41 @@ impl Detector {
     }
 
     /// Takes the image into the background of every scale, except where known targets are.
-    fn learn(&mut self, interval: f64, turned: [f64; 2], known: &[KnownTarget]) {
+    fn learn(&mut self, interval: f64, view: Straightening, known: &[KnownTarget]) {
         // A young background is the plain mean of its images; an old one forgets exponentially.
         let young = 1.0 / (f64::from(self.images) + 1.0);
         let share = young.max(1.0 - (-interval / self.config.background_s).exp()) as f32;
         let turning_px_s = self.turning_px_s();
-        let moment = Moment { turned, turning_px_s, interval, share, is_first: self.images == 0 };
+        let moment = Moment { view, turning_px_s, interval, share, is_first: self.images == 0 };
         for index in 0..self.levels.len() {
             let (finer, rest) = self.levels.split_at_mut(index);
             let level = &mut rest[0];
             if let Some(finer) = finer.last() {
                 halve(&finer.reduced, &mut level.reduced);
             }
-            let covered: Vec<Cells> =
-                known.iter().map(|known| cells_of(level, &known.place)).collect();
-            level.see(moment, &covered);
+            if !view.is_none() {
+                match finer.last() {
+                    Some(finer) => halve(&finer.straight, &mut level.straight),
+                    None => view.straighten(
+                        &level.reduced,
+                        level.cell(),
+                        &mut self.resampler,
+                        &mut level.straight,
+                    ),
+                }
+            }
+            let places = || known.iter().map(|known| known.place);
+            let in_image: Vec<Cells> = places().map(|place| cells_of(level, &place)).collect();
+            if view.is_none() {
+                level.see(moment, &in_image, &in_image);
+                continue;
+            }
+            let straight = places().map(|place| {
+                let [width, height] = [place.width, place.height].map(|side| side * view.scale());
+                cells_of(level, &PixelBox::about(view.straight(place.centre()), width, height))
+            });
+            let straight: Vec<Cells> = straight.collect();
+            level.see(moment, &straight, &in_image);
         }
         self.images = self.images.saturating_add(1);
     }
@@ -324,27 +370,29 @@ impl Detector {
     }
 
     /// Takes the image's plots into the candidates.
-    fn plot(&mut self, interval: f64, turned: [f64; 2], known: &[KnownTarget]) {
+    fn plot(&mut self, interval: f64, known: &[KnownTarget]) {
         plots::find(&mut self.levels, &mut self.plots);
-        let (turning, sides) = (self.turning, self.sides);
+        // What has just come into view has no known background, and what is cut by the border
+        // seems to move as it comes in.
+        let views = &self.views;
         self.plots.retain(|plot| {
             !known.iter().any(|known| touches(&known.place, plot))
-                && !has_come_into_view(plot.place, turning, sides)
+                && views.iter().all(|(_, view)| view.shows(plot.in_scene))
         });
         let px_s = self.turning_px_s();
         let turned_fast_px = if px_s > FAST_TURN_PX_S { px_s * interval } else { 0.0 };
-        self.candidates.step(&self.plots, turned, turned_fast_px, interval, self.sides);
+        self.candidates.step(&self.plots, turned_fast_px, interval, self.sides);
     }
 
     /// Notes how the scene turns, as far as it is registered, and how known targets move.
-    fn note_motion(&mut self, interval: f64, turned: [f64; 2], known: &[KnownTarget]) {
+    fn note_motion(&mut self, interval: f64, turned: SceneTurn, known: &[KnownTarget]) {
         let share = 1.0 - (-interval / TURN_S).exp();
-        for (turning, (now, before)) in
-            self.turning.iter_mut().zip(turned.into_iter().zip(self.turned))
-        {
-            *turning += share * ((now - before) / interval - *turning);
+        let step = turned.and_then(self.last.inverse());
+        let [x, y] = self.sides.map(|side| (side as f64 - 1.0) / 2.0);
+        for (turning, moved) in self.turning.iter_mut().zip(step.moves(ImagePoint { x, y })) {
+            *turning += share * (moved / interval - *turning);
         }
-        self.turned = turned;
+        self.last = turned;
         self.found_targets.retain(|found| known.iter().any(|known| known.id == found.id));
         for known in known {
             let Some(sd) = known.velocity_sd else { continue };
@@ -354,6 +402,23 @@ impl Detector {
                 None => self.found_targets.push(FoundTarget::new(known.id, place)),
             }
         }
+    }
+
+    /// How an image lies against the one in which the background was begun; one that is rolled or
+    /// zoomed too far against it begins the next.
+    fn note_view(&mut self, interval: f64, turned: SceneTurn) -> Straightening {
+        if turned.and_then(self.begun.inverse()).bend() > MOST_BENT {
+            self.forget();
+        }
+        if self.images == 0 {
+            self.begun = turned;
+            self.views.clear();
+        }
+        let view = Straightening::new(turned.and_then(self.begun.inverse()), self.sides);
+        self.views.iter_mut().for_each(|(age_s, _)| *age_s += interval);
+        self.views.retain(|(age_s, _)| *age_s <= COMES_S);
+        self.views.push_back((0.0, view));
+        view
     }
 
     /// How fast the scene turns, in the mean, px/s.
@@ -412,7 +477,8 @@ fn is_found(candidate: &Candidate, sway_px: f64, asked: f64) -> bool {
 }
 
 /// By how much a place stands out on a scale, computed from the finest scale's means.
-fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: [f64; 2]) -> f32 {
+fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: ImagePoint) -> f32 {
+    let place = [place.x, place.y];
     let corner = place.map(|at| (at / cell as f64).floor() as isize - PART_CELLS as isize);
     let side = 2 * PART_CELLS + 1;
     // Only this part of the finest scale is averaged down; one cell of the scale is 2^level cells
@@ -439,11 +505,10 @@ fn covered(place: &PixelBox) -> [[f64; 2]; 2] {
     [[left, top], [left + place.width + 2.0 * margin[0], top + place.height + 2.0 * margin[1]]]
 }
 
-/// The cells of a scale's background that a known target covers.
+/// The cells of a scale's background that a known target covers, by its place in the straightened
+/// image.
 fn cells_of(level: &Level, place: &PixelBox) -> Cells {
-    let [first, last] = covered(place).map(|corner| level.cell_of(corner).map(f64::round));
-    let range = |axis: usize| [first[axis].max(0.0) as usize, (last[axis] + 1.0).max(0.0) as usize];
-    Cells { columns: range(0), rows: range(1) }
+    level.cells_between(covered(place).map(|[x, y]| ImagePoint { x, y }))
 }
 
 /// Paints over a known target, so that it does not hide what is about it.
@@ -462,14 +527,4 @@ fn touches(known: &PixelBox, plot: &Plot) -> bool {
     let reach = |side: f64| side.max(2.0 * plot.cell);
     (plot.place.x - x).abs() <= reach(known.width)
         && (plot.place.y - y).abs() <= reach(known.height)
-}
-
-/// Whether a place has just come into view, as the scene turns by `turning` px/s: its background is
-/// not known, and what is cut by the border seems to move as it comes in. Twice the warm-up, so
-/// that a candidate is begun by what is seen whole.
-fn has_come_into_view(place: ImagePoint, turning: [f64; 2], sides: [usize; 2]) -> bool {
-    [place.x, place.y].iter().zip(turning).zip(sides).any(|((at, turning), side)| {
-        let way = 2.0 * WARM_UP_S * turning;
-        *at < -way || *at > side as f64 - way
-    })
 }

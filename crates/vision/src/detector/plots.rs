@@ -32,6 +32,8 @@ const MOST_PLOTS: usize = 200;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Plot {
     pub(super) place: ImagePoint,
+    /// Where that was in the first image.
+    pub(super) in_scene: [f64; 2],
     /// Whether it is brighter or darker than its surroundings.
     pub(super) is_brighter: bool,
     /// The scale at which it stands out most: its number, and the side of its cells, px.
@@ -126,11 +128,12 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
     {
         return None;
     }
-    let [x, y] = level.place_of([0, 1].map(|axis| refined(&level.now, top, axis, sign)));
+    let (place, in_scene) = level.place_of([0, 1].map(|axis| refined(&level.now, top, axis, sign)));
     // The measured texture contains the noise: one spread squared is subtracted.
     let texture = (level.texture_about(top).powi(2) - 1.0).max(0.0).sqrt();
     Some(Plot {
-        place: ImagePoint { x, y },
+        place,
+        in_scene,
         is_brighter: sign > 0.0,
         level: index,
         cell: level.cell() as f64,
