@@ -6,12 +6,12 @@
     reason = "a test that cannot set itself up has failed, and one that measures says what it found"
 )]
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use crossfix_correlation::{Plane, Resampler, View};
-use crossfix_tests::{FollowedRow, followed_rows, real_data, succeed};
+use crossfix_tests::{FollowedRow, crossfix, followed_rows, real_data, succeed};
 use crossfix_video::FrameClock;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -135,6 +135,74 @@ fn follow(clip: &Path, motion: Motion) -> Option<Followed> {
     Some(Followed { share: near as f64 / labels.len() as f64, longest_elsewhere })
 }
 
+/// What is found without a box.
+#[derive(Debug, Default)]
+struct Found {
+    labelled: usize,
+    /// Labelled frames with a box within 10 px.
+    near: usize,
+    /// Boxes in those frames, and tracks, that are off by more than 20 px and the target's longer
+    /// side.
+    boxes_elsewhere: usize,
+    tracks_elsewhere: usize,
+}
+
+impl Found {
+    /// Looks for targets in a clip of a moved camera.
+    fn add(&mut self, clip: &Path, motion: Motion) {
+        let folder = tempfile::tempdir().unwrap();
+        let [video, table] = ["moved.y4m", "out.csv"].map(|name| folder.path().join(name));
+        let labels = moved(clip, motion, &video);
+        let [from, to] = [&video, &table].map(|path| path.display().to_string());
+        // It ends with 1 if it has found nothing.
+        crossfix(&["track", &from, "--csv", &to, "-q", "--detect"]);
+        self.labelled += labels.len();
+        if !table.exists() {
+            return;
+        }
+        let (mut near, mut tracks) = (BTreeSet::new(), BTreeSet::new());
+        for row in followed_rows(&table).iter().filter(|row| row.ok == 1) {
+            let (Some([x, y, w, h]), Some(middle)) = (labels.get(&row.frame), row.middle()) else {
+                continue;
+            };
+            let off = (middle[0] - x).hypot(middle[1] - y);
+            if off <= 10.0 {
+                near.insert(row.frame);
+            } else if off > w.max(*h).max(20.0) {
+                self.boxes_elsewhere += 1;
+                tracks.insert(row.id);
+            }
+        }
+        self.near += near.len();
+        self.tracks_elsewhere += tracks.len();
+    }
+
+    fn share(&self) -> f64 {
+        self.near as f64 / self.labelled as f64
+    }
+}
+
+#[test]
+fn drones_are_found_though_the_camera_moves() {
+    let Some(data) = real_data() else { return };
+    // Where nothing was found in a turn of more than 120 px/s, neither of those that are shaken;
+    // where roll and zoom were not known to the detector, 25 and 206 tracks elsewhere.
+    let cases = [
+        ("IR_DRONE_083", Motion::Shake),
+        ("V_DRONE_010", Motion::Shake),
+        ("V_DRONE_074", Motion::Roll),
+        ("V_DRONE_028", Motion::Zoom),
+    ];
+    for (clip, motion) in cases {
+        let clip = data.join("svanstrom-drone-video").join(clip).with_extension("mp4");
+        let mut found = Found::default();
+        found.add(&clip, motion);
+        println!("{}: {motion:?}: {found:?}", clip.display());
+        assert!(found.share() >= 0.9, "{}: {found:?}", clip.display());
+        assert!(found.tracks_elsewhere <= 1, "{}: {found:?}", clip.display());
+    }
+}
+
 #[test]
 fn drones_are_followed_though_the_camera_moves() {
     let Some(data) = real_data() else { return };
@@ -166,7 +234,7 @@ fn how_all_clips_are_followed_though_the_camera_moves() {
         clips
     };
     for (title, folder, prefix) in [
-        ("thermal", "svanstrom-drone-video", "IR_"),
+        ("thermal", "svanstrom-drone-video", "IR_DRONE"),
         ("visible", "svanstrom-drone-video", "V_DRONE"),
         ("Anti-UAV", "anti-uav-ir-video", ""),
     ] {
@@ -179,6 +247,16 @@ fn how_all_clips_are_followed_though_the_camera_moves() {
             let mean = of_clips.iter().map(|clip| clip.share).sum::<f64>() / of_clips.len() as f64;
             let longest = of_clips.iter().map(|clip| clip.longest_elsewhere).max().unwrap();
             println!("{title}: {motion:?}: {:.1} %, elsewhere for {longest}", 100.0 * mean);
+            let mut found = Found::default();
+            clips.iter().for_each(|clip| found.add(clip, motion));
+            let frames = found.labelled as f64;
+            let boxes = found.boxes_elsewhere as f64 / frames;
+            let a_minute = found.tracks_elsewhere as f64 / (frames / RATE_HZ / 60.0);
+            println!(
+                "    without a box: {:.1} %, elsewhere {boxes:.3} boxes a frame, {a_minute:.1} \
+                 tracks a minute",
+                100.0 * found.share()
+            );
         }
     }
 }
