@@ -7,6 +7,8 @@
     reason = "a test that cannot set itself up has failed, and one that is skipped says so"
 )]
 
+pub mod video;
+
 use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
