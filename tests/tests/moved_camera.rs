@@ -165,6 +165,8 @@ fn drones_are_found_though_the_camera_moves() {
         println!("{}: {motion:?}: {finds:?}", clip.display());
         assert!(finds.share() >= 0.9, "{}: {finds:?}", clip.display());
         assert!(finds.boxes_a_frame() <= 0.3, "{}: {finds:?}", clip.display());
+        // One in the ten seconds of a clip.
+        assert!(finds.tracks_a_minute() <= 7.0, "{}: {finds:?}", clip.display());
     }
 }
 

@@ -44,8 +44,7 @@ impl<'a> PictureLevel<'a> {
 
     fn in_pixels(&self, turn: SceneTurn) -> PictureTurn {
         let shift = turn.moves(self.middle).map(|px| (px / self.side) as f32);
-        let (sin, cos) = turn.roll_rad().sin_cos();
-        let [zoom, roll] = [turn.scale() * cos - 1.0, turn.scale() * sin].map(|part| part as f32);
+        let [zoom, roll] = turn.zoom_and_roll().map(|part| part as f32);
         PictureTurn { shift, zoom, roll }
     }
 

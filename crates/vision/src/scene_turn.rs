@@ -71,8 +71,14 @@ impl SceneTurn {
 
     /// How far roll and zoom move what is a px from where they move nothing, px.
     pub(crate) fn bend(self) -> f64 {
+        let [zoom, roll] = self.zoom_and_roll();
+        zoom.hypot(roll)
+    }
+
+    /// The zoom and the roll of [`Self::about`].
+    pub(crate) fn zoom_and_roll(self) -> [f64; 2] {
         let (sin, cos) = self.roll_rad().sin_cos();
-        (self.scale() * cos - 1.0).hypot(self.scale() * sin)
+        [self.scale() * cos - 1.0, self.scale() * sin]
     }
 
     /// Size there over size here.

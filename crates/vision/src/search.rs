@@ -244,10 +244,8 @@ impl Sought<'_> {
         scratch: &mut Scratch,
     ) -> bool {
         let is_anothers = frame.others.iter().any(|other| other.holds(found.place));
-        let [width, height] = self.state.appearance.sides();
-        let found_box = PixelBox::about(found.place, width, height);
         !is_anothers
-            && found_box.share_in_view(frame.image) >= LEAST_IN_VIEW
+            && self.state.is_in_view(frame.image, found.place)
             && self.identity.arrival_log_ratio(self.state, frame, found.place, scratch) >= 0.0
     }
 
@@ -387,6 +385,12 @@ impl TargetBelief {
             corner,
             sides,
         }
+    }
+
+    /// Whether enough of the target is in view where it is at a place for it to be found again.
+    pub(crate) fn is_in_view(&self, image: &Plane, at: ImagePoint) -> bool {
+        let [width, height] = self.appearance.sides();
+        PixelBox::about(at, width, height).share_in_view(image) >= LEAST_IN_VIEW
     }
 
     /// Half sides of the search area, px: they grow with the time since the target was seen.

@@ -87,6 +87,7 @@ impl ImageTarget {
         let fit = self.state.fit_at(peak.column, peak.row, peak.origin, scratch, frame.config);
         let has_come = self.state.appearance.clear_share() > LEAST_CLEAR
             && peak.log_ratio > CLEAR_FIND.least_ratio
+            && self.state.is_in_view(frame.image, fit.place)
             && self.identity.arrival_log_ratio(&self.state, frame, fit.place, scratch) >= 0.0;
         has_come.then_some(SightingOfLost { fit, log_ratio: peak.log_ratio, as_at_first: false })
     }

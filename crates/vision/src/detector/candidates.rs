@@ -6,6 +6,7 @@ use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
 use super::LEAST_PLOTS;
 use super::common_motion::MovingThing;
 use super::plots::Plot;
+use super::views::Views;
 use crate::ImagePoint;
 
 /// What is expected of a target and its plots.
@@ -130,7 +131,8 @@ const CLUTTER: ClutterModel = ClutterModel { cell_px: 32.0, mean_s: 3.0, least: 
 
 /// A track of plots that may be a target.
 ///
-/// Its places are in the scene: as in the first image, whatever the camera has turned since.
+/// Its places are in the scene: as in the image in which the background was begun, whatever the
+/// camera has turned since.
 #[derive(Clone, Debug)]
 pub(super) struct Candidate {
     axes: [AxisFilter; 2],
@@ -174,12 +176,12 @@ impl Candidate {
         }
     }
 
-    /// How it moves in the image, where the scene is registered as turning by `turning`, px/s.
-    pub(super) fn moving(&self, turning: [f64; 2]) -> MovingThing {
+    /// How it moves in the image.
+    pub(super) fn moving(&self, views: &Views) -> MovingThing {
         let variance = self.axes.iter().map(|axis| axis.covariance().m22).sum::<f64>() / 2.0;
         MovingThing {
             place: self.plot.place,
-            velocity: [0, 1].map(|i| self.axes[i].velocity() - turning[i]),
+            velocity: views.velocity_in_image([0, 1].map(|i| self.axes[i].velocity())),
             sd: variance.sqrt(),
         }
     }
@@ -394,6 +396,11 @@ impl Candidates {
             (candidate.gone_px, candidate.gone_in_image_px) = (0.0, 0.0);
             candidate.turned_fast_px = 0.0;
         }
+    }
+
+    /// Forgets all candidates, and keeps what is known of chance.
+    pub(super) fn clear(&mut self) {
+        self.list.clear();
     }
 
     /// Removes the candidates of which a condition is true, and returns them.

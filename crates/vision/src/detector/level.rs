@@ -1,10 +1,11 @@
 //! One scale of the image: by how much each cell stands out of its surroundings, how that has been
 //! over the last seconds, and how much it has changed now.
 
-use crossfix_correlation::Plane;
+use crossfix_correlation::{Plane, Resampler};
 
 use super::cell_update::{BackgroundRow, CellUpdate, OUTLYING, slope_squared};
-use super::filter::{SURROUNDINGS, StandOutScratch, between, moved, resample, stand_out};
+use super::cells::{Cells, CellsInView, free_of};
+use super::filter::{SURROUNDINGS, StandOutScratch, between, halve, moved, resample, stand_out};
 use super::lens::OnLens;
 use super::straight::Straightening;
 use crate::ImagePoint;
@@ -62,7 +63,7 @@ const CONTRASTS: [f32; 2] = [0.5, 2.0];
 /// Time and camera direction of an image, for the background.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Moment {
-    /// How the image lies against the first one.
+    /// How the image lies against that in which the background was begun.
     pub(super) view: Straightening,
     /// How fast it turns, in the mean, px/s.
     pub(super) turning_px_s: f64,
@@ -73,29 +74,10 @@ pub(super) struct Moment {
     pub(super) is_first: bool,
 }
 
-/// A range of cells: from the first to before the second, in columns and in rows.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Cells {
-    pub(super) columns: [usize; 2],
-    pub(super) rows: [usize; 2],
-}
-
-impl Cells {
-    /// Whether the range is in a cell's surroundings: what covers it may stand out there.
-    fn are_near(&self, [x, y]: [usize; 2]) -> bool {
-        is_near(x, self.columns) && is_near(y, self.rows)
-    }
-}
-
-/// Whether a column or row is in a range or within a cell's surroundings of it.
-fn is_near(at: usize, [from, to]: [usize; 2]) -> bool {
-    at + SURROUNDINGS >= from && at < to.saturating_add(SURROUNDINGS)
-}
-
 /// One scale.
 ///
 /// The background's cells are fixed to the scene: when the camera turns they move over the image by
-/// whole cells, and for the rest the image is sampled between its own cells. A second mean keeps
+/// whole cells, and for the rest the straightened image is sampled between its own cells. A second mean keeps
 /// the image's cells: what is on the lens, or written over the picture.
 #[derive(Debug)]
 pub(super) struct Level {
@@ -114,8 +96,10 @@ pub(super) struct Level {
     on_lens: OnLens,
     /// Change of this image from the mean, standard deviations; 0 where a known target is.
     pub(super) change: Plane,
-    /// How this image lies against the first one.
+    /// How this image lies against that in which the background was begun, and which of a row's
+    /// cells are in view.
     view: Straightening,
+    in_view: CellsInView,
     /// Shift of the background against the straightened image, cells: the whole ones, and the
     /// rest.
     whole: [isize; 2],
@@ -145,6 +129,7 @@ impl Level {
             reduced: Plane::default(),
             straight: Plane::default(),
             view: Straightening::new(SceneTurn::none(), [0; 2]),
+            in_view: CellsInView::default(),
             stands_out: Plane::default(),
             stand_out_scratch: StandOutScratch::default(),
             now: Plane::default(),
@@ -165,6 +150,12 @@ impl Level {
         }
     }
 
+    /// Forgets the background, and keeps what is known of the image's noise and of the sway.
+    pub(super) fn begin_anew(&mut self) {
+        let (persistence, sway) = (self.persistence, self.sway);
+        *self = Self { persistence, sway, ..Self::new(self.cell) };
+    }
+
     /// Side of a cell, px.
     pub(super) fn cell(&self) -> usize {
         self.cell
@@ -180,8 +171,8 @@ impl Level {
         self.is_lost
     }
 
-    /// Where the middle of a background's cell is in the image, px, and where that was in the first
-    /// one.
+    /// Where the middle of a background's cell is in the image, px, and where that was when the
+    /// background was begun.
     pub(super) fn place_of(&self, cell: [f64; 2]) -> (ImagePoint, [f64; 2]) {
         let side = self.cell as f64;
         let [x, y] = [0, 1].map(|i| (cell[i] - f64::from(self.rest[i]) + 0.5) * side - 0.5);
@@ -256,6 +247,25 @@ impl Level {
         OF_MEDIAN * median(&mut self.scratch) / self.spread
     }
 
+    /// Fills `reduced` from the next finer scale, or straightens it where it is given as the finest.
+    pub(super) fn reduce(
+        &mut self,
+        finer: Option<&Self>,
+        view: Straightening,
+        resampler: &mut Resampler,
+    ) {
+        match finer {
+            Some(finer) => {
+                halve(&finer.reduced, &mut self.reduced);
+                if !view.is_none() {
+                    halve(&finer.straight, &mut self.straight);
+                }
+            }
+            None if view.is_none() => {}
+            None => view.straighten(&self.reduced, self.cell, resampler, &mut self.straight),
+        }
+    }
+
     /// Takes in the image in `reduced` and `straight`, and learns it except where `known` covers it,
     /// and in the image itself `known_in_image`.
     pub(super) fn see(&mut self, moment: Moment, known: &[Cells], known_in_image: &[Cells]) {
@@ -266,6 +276,7 @@ impl Level {
             stand_out(&self.straight, &mut self.stands_out, &mut self.stand_out_scratch);
         }
         self.turn(moment);
+        self.in_view.see(self.view, [self.now.width(), self.now.height()], self.cell);
         if moment.is_first {
             self.mean.copy_from(&self.now);
             self.variance.reshape(self.now.width(), self.now.height());
@@ -306,7 +317,11 @@ impl Level {
         let (width, height) = (self.now.width(), self.now.height());
         let step = sampling_step(width * height);
         // Contrast c: the median of now / mean over the cells that stand out.
-        let cells = || self.mean.samples().iter().zip(self.now.samples()).step_by(step);
+        let cells = || {
+            let cells = self.mean.samples().iter().zip(self.now.samples()).enumerate();
+            let sampled = cells.step_by(step).filter(|(i, _)| self.in_view.hold(*i));
+            sampled.map(|(_, cell)| cell)
+        };
         self.scratch.clear();
         self.scratch.extend(
             cells()
@@ -338,8 +353,7 @@ impl Level {
         let mean = self.mean.samples();
         let noise = self.spread * self.spread;
         for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
-            if i % width == 0 || i % width == width - 1 || !self.is_in_view([i % width, i / width])
-            {
+            if i % width == 0 || i % width == width - 1 {
                 continue;
             }
             let slope =
@@ -347,6 +361,7 @@ impl Level {
             // A cell shows the sway only if a sway of `PROBE_PX` changes it by more than noise
             // does, and if no known target can stand out there.
             if probe * slope > noise
+                && self.in_view.hold(i)
                 && !known.iter().any(|cells| cells.are_near([i % width, i / width]))
             {
                 let usual = self.variance.samples()[i].max(noise);
@@ -376,11 +391,6 @@ impl Level {
             self.is_textured && (sways_too_far || changed as f32 > MOST_CHANGED * textured as f32);
     }
 
-    /// Whether a background's cell is in view.
-    fn is_in_view(&self, [x, y]: [usize; 2]) -> bool {
-        self.view.cells_in_view(y, self.now.width(), self.cell).contains(&x)
-    }
-
     /// Converts the changes to standard deviations, and learns the background.
     fn learn(&mut self, share: f32, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
@@ -397,7 +407,7 @@ impl Level {
             update.textures(above, self.mean.row(y), below, &mut self.scratch);
             let change = self.change.row_mut(y);
             change.fill(0.0);
-            let in_view = self.view.cells_in_view(y, width, self.cell);
+            let in_view = self.in_view.of_row(y);
             for [from, to] in free_of(known, y, width) {
                 let (from, to) = (from.max(in_view.start), to.min(in_view.end));
                 if from >= to {
@@ -442,38 +452,9 @@ fn sampling_step(cells: usize) -> usize {
     (cells / SAMPLES) | 1
 }
 
-/// The parts of a row that no known target covers.
-pub(super) fn free_of(known: &[Cells], row: usize, width: usize) -> Vec<[usize; 2]> {
-    let in_row = known.iter().filter(|cells| (cells.rows[0]..cells.rows[1]).contains(&row));
-    let mut covered: Vec<[usize; 2]> = in_row.map(|cells| cells.columns).collect();
-    covered.sort_unstable();
-    covered.push([width, width]);
-    let mut at = 0;
-    let mut free = Vec::with_capacity(covered.len());
-    for [from, to] in covered {
-        if from.min(width) > at {
-            free.push([at, from.min(width)]);
-        }
-        at = at.max(to);
-    }
-    free
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn what_is_free_of_a_row_is_between_what_is_known() {
-        let known = [
-            Cells { columns: [5, 8], rows: [0, 4] },
-            Cells { columns: [2, 6], rows: [3, 9] },
-            Cells { columns: [15, 40], rows: [3, 4] },
-        ];
-        assert_eq!(free_of(&known, 3, 20), [[0, 2], [8, 15]]);
-        assert_eq!(free_of(&known, 2, 20), [[0, 5], [8, 20]]);
-        assert_eq!(free_of(&known, 10, 20), [[0, 20]]);
-    }
 
     /// Sky above waves, seen by a camera that has turned by `turned` pixels and is shaken.
     fn see_waves(level: &mut Level, turned: [f64; 2], is_first: bool, shaken: f64) {

@@ -17,6 +17,7 @@
 
 mod candidates;
 mod cell_update;
+mod cells;
 mod common_motion;
 mod filter;
 mod lens;
@@ -24,8 +25,8 @@ mod level;
 mod outline;
 mod plots;
 mod straight;
-
-use std::collections::VecDeque;
+mod views;
+mod watched;
 
 use crossfix_correlation::{Plane, Resampler};
 
@@ -33,11 +34,14 @@ use crate::crop::{paint_over, replace_invalid};
 use crate::scene_turn::SceneTurn;
 use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
+use cells::Cells;
 use common_motion::{CommonMotion, FoundTarget};
-use filter::{StandOutScratch, between, halve, stand_out};
-use level::{Cells, Level, Moment};
+use filter::halve;
+use level::{Level, Moment};
 use plots::Plot;
 use straight::Straightening;
+use views::Views;
+use watched::Watched;
 
 /// Sides of the cells of the scales, px: what is found is two or three cells large, 4 to 48 px.
 /// With half of each, what is larger than 24 px makes plots at its edges only.
@@ -86,42 +90,6 @@ const LEAST_CHANCES: f64 = 600.0;
 /// Margin of a known target that is covered with it: a share of its sides, and px. With half of it
 /// rotors and shadows beyond the box are found as other targets.
 const COVER: [f64; 2] = [0.25, 2.0];
-/// Sides of a target in cells of the scale at which it stands out most. With half of it a target is
-/// watched on the next coarser scale, stands out less there and is sooner mistaken for the scene.
-const TARGET_CELLS: f64 = 2.5;
-/// Half side of the part of the image from which it is computed how much a target stands out,
-/// cells: the surroundings of the target's own cell and its neighbours'. With half of it the
-/// surroundings are cut off, and the part's border is repeated in their place.
-const PART_CELLS: usize = filter::SURROUNDINGS + 2;
-/// A watched target is new in an image if the background lacks at least this share of what stands
-/// out there (with half of it clouds and changing light make the scene new, with twice as much a
-/// target in front of its like is mistaken for the scene), ...
-const NEW: f32 = 0.35;
-/// ... and if it stands out by at least this share of the least strength of a plot. With half of it
-/// noise alone, of 1.2 spreads, makes it new in one case of five.
-const STANDS_OUT: f32 = 0.7;
-/// Least share of the latest images in which a watched target must be new: with a smaller share it
-/// is the scene, and given up. That is so after 0.6 s; with half of it after 0.95.
-const LEAST_NEW: f64 = 0.3;
-/// Averaging time of that share, s. With half of it the scene is given up after 0.3 s instead of
-/// 0.6, and so is a target that flies in front of its like for as long.
-const NEW_S: f64 = 0.5;
-
-/// Averaging time of the registered turn, s: a jerk of one image is no turn. With half of it a jerk
-/// of 20 px makes all that is in view move at 200 px/s instead of 100.
-const TURN_S: f64 = 0.2;
-
-/// Most roll (rad) and zoom (a share) of an image against that in which the background was begun:
-/// corners are out of view by then, and what is zoomed is blurred. With half of it a camera that
-/// zooms to twice the size begins six times anew, and finds nothing for a quarter of a second each
-/// time.
-const MOST_BENT: f64 = 0.25;
-
-/// What has come into view less than this ago is not found, s: twice the warm-up, so that a
-/// candidate is begun by what is seen whole. With half of it what comes into a panning camera's
-/// view is found (reasoned, not measured).
-const COMES_S: f64 = 2.0 * WARM_UP_S;
-
 /// A turn faster than this, px/s, counts for [`PARALLAX`]: in slower ones what is near has not gone
 /// far before it is known. With half of it what drifts in a slow pan is found later (reasoned, not
 /// measured).
@@ -154,19 +122,6 @@ pub(crate) struct Findings {
     pub(crate) scene: Vec<ImageTrackId>,
 }
 
-/// A known target that may turn out to be the scene.
-#[derive(Clone, Copy, Debug)]
-struct SceneSuspect {
-    id: ImageTrackId,
-    /// Index of the scale that fits its size.
-    level: usize,
-    place: ImagePoint,
-    /// By how much it stands out in this image, levels.
-    stands_out: f32,
-    /// Running share of the images in which it was new.
-    share_new: f64,
-}
-
 /// Finds what differs from the background.
 #[derive(Debug)]
 pub(crate) struct Detector {
@@ -182,20 +137,12 @@ pub(crate) struct Detector {
     lost_s: f64,
     plots: Vec<Plot>,
     candidates: Candidates,
-    /// Where what was in the image in which the background was begun, and in the last one, was at
-    /// the beginning.
-    begun: SceneTurn,
-    last: SceneTurn,
-    /// A running mean of how fast the middle of the image turns, px/s.
-    turning: [f64; 2],
-    /// How the images of the last [`COMES_S`] lie against the one in which the background was
-    /// begun, and their ages, s.
-    views: VecDeque<(f64, Straightening)>,
+    views: Views,
     resampler: Resampler,
     /// How long most of what moves has moved alike, s.
     alike_s: f64,
     found_targets: Vec<FoundTarget>,
-    watches: Vec<SceneSuspect>,
+    watched: Watched,
 }
 
 impl Detector {
@@ -210,19 +157,16 @@ impl Detector {
             lost_s: 0.0,
             plots: Vec::new(),
             candidates: Candidates::default(),
-            begun: SceneTurn::none(),
-            last: SceneTurn::none(),
-            turning: [0.0; 2],
-            views: VecDeque::new(),
+            views: Views::new([0; 2]),
             resampler: Resampler::default(),
             alike_s: 0.0,
             found_targets: Vec::new(),
-            watches: Vec::new(),
+            watched: Watched::default(),
         }
     }
 
     /// Takes the next image, `interval` seconds after the last one. `turned` is where what is in it
-    /// was at the beginning.
+    /// was in the tracker's first image.
     pub(crate) fn step(
         &mut self,
         image: &Plane,
@@ -233,16 +177,17 @@ impl Detector {
         if self.sides != [image.width(), image.height()] {
             *self = Self::new(self.config.clone());
             self.sides = [image.width(), image.height()];
+            self.views = Views::new(self.sides);
             let fits = |cell: &&usize| self.sides.iter().all(|side| side / **cell >= LEAST_CELLS);
             self.levels = CELLS.iter().take_while(fits).map(|cell| Level::new(*cell)).collect();
         }
-        self.note_motion(interval, turned, known);
-        let view = self.note_view(interval, turned);
+        self.note_known(interval, known);
+        let view = self.view(interval, turned);
         let Some(finest) = self.levels.first_mut() else { return Findings::default() };
         halve(image, &mut finest.reduced);
         replace_invalid(&mut finest.reduced);
         // How much the known targets stand out is measured before they are painted over.
-        self.watch(known);
+        self.watched.note(known, &self.levels);
         for known in known {
             cover(&mut self.levels[0].reduced, &known.place);
         }
@@ -258,7 +203,7 @@ impl Detector {
         if self.images > 1 {
             self.settled_s += interval;
         }
-        let scene = self.take_scene(interval);
+        let scene = self.watched.take_scene(&self.levels, interval);
         let is_warm = self.settled_s >= WARM_UP_S && self.images > WARM_UP_IMAGES;
         self.has_warmed |= is_warm;
         let mut findings = Findings { found: Vec::new(), scene };
@@ -278,36 +223,24 @@ impl Detector {
         (self.images, self.settled_s) = (0, 0.0);
         (self.has_warmed, self.lost_s, self.alike_s) = (false, 0.0, 0.0);
         self.candidates = Candidates::default();
-        self.watches.clear();
+        self.watched.clear();
     }
 
-    /// Notes by how much each watched target stands out, before it is covered.
-    fn watch(&mut self, known: &[KnownTarget]) {
-        self.watches
-            .retain(|watch| known.iter().any(|known| known.id == watch.id && known.is_watched));
-        for known in known.iter().filter(|known| known.is_watched) {
-            let side = known.place.width.max(known.place.height) / TARGET_CELLS;
-            // Sizes differ by ratios: the nearest scale has the least |ln(cell / side)|.
-            let off = |level: &Level| (level.cell() as f64 / side).ln().abs();
-            let nearest = (0..self.levels.len())
-                .min_by(|one, other| off(&self.levels[*one]).total_cmp(&off(&self.levels[*other])));
-            let Some(level) = nearest else { return };
-            let place = known.place.centre();
-            let stands_out =
-                stands_out_at(&self.levels[0].reduced, level, self.levels[level].cell(), place);
-            match self.watches.iter_mut().find(|watch| watch.id == known.id) {
-                Some(watch) => {
-                    (watch.level, watch.place, watch.stands_out) = (level, place, stands_out);
-                }
-                None => self.watches.push(SceneSuspect {
-                    id: known.id,
-                    level,
-                    place,
-                    stands_out,
-                    share_new: 1.0,
-                }),
-            }
+    /// How the next image lies against the one in which the background was begun; one that is rolled
+    /// or zoomed too far against it begins the background anew. What is known of noise, chance and
+    /// targets is kept.
+    fn view(&mut self, interval: f64, turned: SceneTurn) -> Straightening {
+        self.views.note_turn(turned, interval);
+        if self.views.is_bent_too_far() && self.images > 0 {
+            self.levels.iter_mut().for_each(Level::begin_anew);
+            (self.images, self.settled_s) = (0, 0.0);
+            (self.has_warmed, self.lost_s) = (false, 0.0);
+            self.candidates.clear();
         }
+        if self.images == 0 {
+            self.views.begin();
+        }
+        self.views.take()
     }
 
     /// Takes the image into the background of every scale, except where known targets are.
@@ -315,84 +248,36 @@ impl Detector {
         // A young background is the plain mean of its images; an old one forgets exponentially.
         let young = 1.0 / (f64::from(self.images) + 1.0);
         let share = young.max(1.0 - (-interval / self.config.background_s).exp()) as f32;
-        let turning_px_s = self.turning_px_s();
+        let turning_px_s = self.views.turning_px_s();
         let moment = Moment { view, turning_px_s, interval, share, is_first: self.images == 0 };
         for index in 0..self.levels.len() {
             let (finer, rest) = self.levels.split_at_mut(index);
             let level = &mut rest[0];
-            if let Some(finer) = finer.last() {
-                halve(&finer.reduced, &mut level.reduced);
-            }
-            if !view.is_none() {
-                match finer.last() {
-                    Some(finer) => halve(&finer.straight, &mut level.straight),
-                    None => view.straighten(
-                        &level.reduced,
-                        level.cell(),
-                        &mut self.resampler,
-                        &mut level.straight,
-                    ),
-                }
-            }
-            let places = || known.iter().map(|known| known.place);
-            let in_image: Vec<Cells> = places().map(|place| cells_of(level, &place)).collect();
-            if view.is_none() {
-                level.see(moment, &in_image, &in_image);
-                continue;
-            }
-            let straight = places().map(|place| {
-                let [width, height] = [place.width, place.height].map(|side| side * view.scale());
-                cells_of(level, &PixelBox::about(view.straight(place.centre()), width, height))
-            });
-            let straight: Vec<Cells> = straight.collect();
+            level.reduce(finer.last(), view, &mut self.resampler);
+            let in_image = known.iter().map(|known| cells_of(level, &known.place));
+            let in_image: Vec<Cells> = in_image.collect();
+            let straight = known.iter().map(|known| view.straight_box(known.place));
+            let straight: Vec<Cells> = straight.map(|place| cells_of(level, &place)).collect();
             level.see(moment, &straight, &in_image);
         }
         self.images = self.images.saturating_add(1);
     }
 
-    /// Removes those of the watched targets that are the scene, and returns them.
-    fn take_scene(&mut self, interval: f64) -> Vec<ImageTrackId> {
-        let share = 1.0 - (-interval / NEW_S).exp();
-        for watch in &mut self.watches {
-            let level = &self.levels[watch.level];
-            // What stands out now, less what the background without the target would show there.
-            let excess = watch.stands_out - level.background(watch.place);
-            let is_new = watch.stands_out.abs()
-                > STANDS_OUT * level.least_strength() * level.spread
-                && excess.abs() >= NEW * watch.stands_out.abs();
-            // s += a (new - s), a = 1 - exp(-T / tau), new = 0 or 1.
-            watch.share_new += share * (f64::from(u8::from(is_new)) - watch.share_new);
-        }
-        self.watches
-            .extract_if(.., |watch| watch.share_new < LEAST_NEW)
-            .map(|watch| watch.id)
-            .collect()
-    }
-
     /// Takes the image's plots into the candidates.
     fn plot(&mut self, interval: f64, known: &[KnownTarget]) {
         plots::find(&mut self.levels, &mut self.plots);
-        // What has just come into view has no known background, and what is cut by the border
-        // seems to move as it comes in.
         let views = &self.views;
         self.plots.retain(|plot| {
             !known.iter().any(|known| touches(&known.place, plot))
-                && views.iter().all(|(_, view)| view.shows(plot.in_scene))
+                && views.have_shown(plot.in_scene)
         });
-        let px_s = self.turning_px_s();
+        let px_s = self.views.turning_px_s();
         let turned_fast_px = if px_s > FAST_TURN_PX_S { px_s * interval } else { 0.0 };
         self.candidates.step(&self.plots, turned_fast_px, interval, self.sides);
     }
 
-    /// Notes how the scene turns, as far as it is registered, and how known targets move.
-    fn note_motion(&mut self, interval: f64, turned: SceneTurn, known: &[KnownTarget]) {
-        let share = 1.0 - (-interval / TURN_S).exp();
-        let step = turned.and_then(self.last.inverse());
-        let [x, y] = self.sides.map(|side| (side as f64 - 1.0) / 2.0);
-        for (turning, moved) in self.turning.iter_mut().zip(step.moves(ImagePoint { x, y })) {
-            *turning += share * (moved / interval - *turning);
-        }
-        self.last = turned;
+    /// Notes how known targets that the detector has found move.
+    fn note_known(&mut self, interval: f64, known: &[KnownTarget]) {
         self.found_targets.retain(|found| known.iter().any(|known| known.id == found.id));
         for known in known {
             let Some(sd) = known.velocity_sd else { continue };
@@ -404,41 +289,19 @@ impl Detector {
         }
     }
 
-    /// How an image lies against the one in which the background was begun; one that is rolled or
-    /// zoomed too far against it begins the next.
-    fn note_view(&mut self, interval: f64, turned: SceneTurn) -> Straightening {
-        if turned.and_then(self.begun.inverse()).bend() > MOST_BENT {
-            self.forget();
-        }
-        if self.images == 0 {
-            self.begun = turned;
-            self.views.clear();
-        }
-        let view = Straightening::new(turned.and_then(self.begun.inverse()), self.sides);
-        self.views.iter_mut().for_each(|(age_s, _)| *age_s += interval);
-        self.views.retain(|(age_s, _)| *age_s <= COMES_S);
-        self.views.push_back((0.0, view));
-        view
-    }
-
-    /// How fast the scene turns, in the mean, px/s.
-    fn turning_px_s(&self) -> f64 {
-        self.turning[0].hypot(self.turning[1])
-    }
-
     /// Where most of what moves moves alike, that is the scene: the distance of such candidates
     /// counts from here, and the targets that have turned out to be the scene are returned.
     fn take_common_motion(&mut self, interval: f64) -> Vec<ImageTrackId> {
         // What is registered of a bare scene's turn is a part of it.
-        let turning = self.turning;
-        let candidates = self.candidates.likely().map(|candidate| candidate.moving(turning));
+        let views = &self.views;
+        let candidates = self.candidates.likely().map(|candidate| candidate.moving(views));
         let all = self.found_targets.iter().map(|found| found.now).chain(candidates);
         let Some(scene) = CommonMotion::of(all, self.sides) else {
             self.alike_s = 0.0;
             return Vec::new();
         };
         self.alike_s += interval;
-        self.candidates.restart_distance_if(|candidate| scene.holds(&candidate.moving(turning)));
+        self.candidates.restart_distance_if(|candidate| scene.holds(&candidate.moving(views)));
         let alike_s = self.alike_s;
         self.found_targets
             .extract_if(.., |found| found.is_scene(&scene, alike_s, interval))
@@ -474,27 +337,6 @@ fn is_found(candidate: &Candidate, sway_px: f64, asked: f64) -> bool {
         // turns.
         && candidate.gone_in_image_px > place_error
         && candidate.log_ratio() > asked
-}
-
-/// By how much a place stands out on a scale, computed from the finest scale's means.
-fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: ImagePoint) -> f32 {
-    let place = [place.x, place.y];
-    let corner = place.map(|at| (at / cell as f64).floor() as isize - PART_CELLS as isize);
-    let side = 2 * PART_CELLS + 1;
-    // Only this part of the finest scale is averaged down; one cell of the scale is 2^level cells
-    // there.
-    let fine = 1 << level;
-    let mut part =
-        finest.crop(corner[0] * fine as isize, corner[1] * fine as isize, side * fine, side * fine);
-    for _ in 0..level {
-        let mut halved = Plane::default();
-        halve(&part, &mut halved);
-        part = halved;
-    }
-    let mut out = Plane::default();
-    stand_out(&part, &mut out, &mut StandOutScratch::default());
-    // From pixels to cells of the part; the middle of a cell is a whole number on both sides.
-    between(&out, [0, 1].map(|i| (place[i] + 0.5) / cell as f64 - 0.5 - corner[i] as f64))
 }
 
 /// What is covered of a known target's box with its margin, px: left and top, right and bottom.

@@ -32,7 +32,7 @@ const MOST_PLOTS: usize = 200;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Plot {
     pub(super) place: ImagePoint,
-    /// Where that was in the first image.
+    /// Where that was when the background was begun.
     pub(super) in_scene: [f64; 2],
     /// Whether it is brighter or darker than its surroundings.
     pub(super) is_brighter: bool,

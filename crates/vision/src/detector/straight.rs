@@ -5,12 +5,12 @@ use std::ops::Range;
 
 use crossfix_correlation::{Plane, Resampler, View};
 
-use crate::ImagePoint;
 use crate::scene_turn::SceneTurn;
+use crate::{ImagePoint, PixelBox};
 
 /// What roll and zoom move by less than this, px, is left as it is: a sharp image is worth more.
 /// With half of it the noise of the registration blurs the images of a camera that only pans.
-const STRAIGHT_PX: f64 = 0.25;
+const UNBENT_PX: f64 = 0.25;
 
 /// How an image lies against that in which the background was begun: what is at a place of it was
 /// at that place rolled and zoomed about the middle, and then shifted.
@@ -18,6 +18,8 @@ const STRAIGHT_PX: f64 = 0.25;
 pub(super) struct Straightening {
     /// Where what is at a place of the image is in the straightened one.
     bent: SceneTurn,
+    /// The same the other way.
+    unbent: SceneTurn,
     /// From there to where it was, px.
     shift: [f64; 2],
     sides: [usize; 2],
@@ -28,11 +30,11 @@ impl Straightening {
     pub(super) fn new(turn: SceneTurn, sides: [usize; 2]) -> Self {
         let [x, y] = sides.map(|side| (side as f64 - 1.0) / 2.0);
         let middle = ImagePoint { x, y };
-        let (sin, cos) = turn.roll_rad().sin_cos();
-        let is_bent = turn.bend() * x.hypot(y) > STRAIGHT_PX;
-        let bent = SceneTurn::about(middle, [0.0; 2], turn.scale() * cos - 1.0, turn.scale() * sin);
+        let is_bent = turn.bend() * x.hypot(y) > UNBENT_PX;
+        let [zoom, roll] = turn.zoom_and_roll();
+        let bent = SceneTurn::about(middle, [0.0; 2], zoom, roll);
         let bent = if is_bent { bent } else { SceneTurn::none() };
-        Self { bent, shift: turn.moves(middle), sides }
+        Self { bent, unbent: bent.inverse(), shift: turn.moves(middle), sides }
     }
 
     /// By how much what is in the straightened image was farther, px.
@@ -45,19 +47,29 @@ impl Straightening {
         self.bent == SceneTurn::none()
     }
 
-    /// Size in the straightened image over size in the image.
-    pub(super) fn scale(&self) -> f64 {
-        self.bent.scale()
-    }
-
     /// Where what is at a place of the image is in the straightened one.
     pub(super) fn straight(&self, place: ImagePoint) -> ImagePoint {
         self.bent.place(place)
     }
 
+    /// Where what is in a box of the image is in the straightened one.
+    pub(super) fn straight_box(&self, place: PixelBox) -> PixelBox {
+        // What is about it, turned: |1 + zoom| w + |roll| h across.
+        let [zoom, roll] = self.bent.zoom_and_roll();
+        let about = |along: f64, across: f64| (1.0 + zoom).abs() * along + roll.abs() * across;
+        let [width, height] = [about(place.width, place.height), about(place.height, place.width)];
+        PixelBox::about(self.straight(place.centre()), width, height)
+    }
+
+    /// A velocity of the straightened image in the image.
+    pub(super) fn velocity_in_image(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        let [from, to] = [[0.0; 2], [x, y]].map(|[x, y]| self.unbent.place(ImagePoint { x, y }));
+        [to.x - from.x, to.y - from.y]
+    }
+
     /// Where what is at a place of the straightened image is in the image.
     pub(super) fn in_image(&self, straight: ImagePoint) -> ImagePoint {
-        self.bent.inverse().place(straight)
+        self.unbent.place(straight)
     }
 
     /// Where what is at a place of the straightened image was when the background was begun.
@@ -65,8 +77,7 @@ impl Straightening {
         [straight.x + self.shift[0], straight.y + self.shift[1]]
     }
 
-    /// Where what was at a place when the background was begun is in the image, and whether that
-    /// is in view.
+    /// Whether what was at a place when the background was begun is in view.
     pub(super) fn shows(&self, [x, y]: [f64; 2]) -> bool {
         let straight = ImagePoint { x: x - self.shift[0], y: y - self.shift[1] };
         let place = self.in_image(straight);
