@@ -27,6 +27,8 @@ fn is_near(at: usize, [from, to]: [usize; 2]) -> bool {
 /// Which of a scale's cells are in view.
 #[derive(Debug, Default)]
 pub(super) struct CellsInView {
+    /// Whether all are.
+    are_all: bool,
     /// Number of cells in a row.
     width: usize,
     /// Those in view, row by row.
@@ -36,14 +38,14 @@ pub(super) struct CellsInView {
 impl CellsInView {
     /// Notes which cells of a scale, with cells of `cell` px, a view shows.
     pub(super) fn see(&mut self, view: Straightening, [width, height]: [usize; 2], cell: usize) {
-        self.width = width;
+        (self.are_all, self.width) = (view.is_none(), width);
         self.rows.clear();
         self.rows.extend((0..height).map(|row| view.cells_in_view(row, width, cell)));
     }
 
     /// Whether a cell is in view, by its number among all.
     pub(super) fn hold(&self, cell: usize) -> bool {
-        self.rows[cell / self.width].contains(&(cell % self.width))
+        self.are_all || self.rows[cell / self.width].contains(&(cell % self.width))
     }
 
     /// The cells of a row that are in view.
