@@ -8,9 +8,10 @@ use crossfix_correlation::{Plane, Resampler, View};
 use crate::scene_turn::SceneTurn;
 use crate::{ImagePoint, PixelBox};
 
-/// What roll and zoom move by less than this, px, is left as it is: a sharp image is worth more.
-/// With half of it the noise of the registration blurs the images of a camera that only pans.
-const UNBENT_PX: f64 = 0.25;
+/// What roll and zoom move by less than this in the corners, px, a quarter of the finest cell, is
+/// left as it is: a sharp image is worth more, and a third of the detector's time is spared. With
+/// half of it the noise of the registration blurs the images of a camera that only pans.
+const UNBENT_PX: f64 = 0.5;
 
 /// How an image lies against that in which the background was begun: what is at a place of it was
 /// at that place rolled and zoomed about the middle, and then shifted.
