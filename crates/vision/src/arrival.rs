@@ -50,7 +50,7 @@ const LIGHTER: [f64; 2] = [0.5, 2.0];
 /// sampled straight is sharper. With half of it small turns blur a picture, and what is the same
 /// counts as having changed a little.
 const STRAIGHT_PX: f64 = 0.2;
-/// Least share of the reference's energy that must lie where the target was not before. With half
+/// Least share of the reference's energy that must lie in view, where the target was not before. With half
 /// of it contrasts are measured by an eighth of the energy, with eight times the whole's noise
 /// variance; with twice as much a slow target's pictures show nothing for longer.
 const LEAST_FREE: f64 = 0.25;
@@ -184,8 +184,8 @@ impl ComparisonBuffers {
 
     /// Compares that sample with what a picture has: in the place where it should be, and where
     /// that says that it has come, in the place within reach where it is likeliest the same. Pixels
-    /// where the target was seen in that picture do not count; `None` if these are nearly all, or
-    /// the place where it should be was outside the picture.
+    /// where the target was seen in that picture do not count, nor those beyond a border; `None` if
+    /// these are nearly all, or the place where it should be was outside the picture.
     pub(crate) fn with(
         &mut self,
         then: PlaceThen<'_>,

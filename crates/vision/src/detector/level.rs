@@ -77,8 +77,8 @@ pub(super) struct Moment {
 /// One scale.
 ///
 /// The background's cells are fixed to the scene: when the camera turns they move over the image by
-/// whole cells, and for the rest the straightened image is sampled between its own cells. A second mean keeps
-/// the image's cells: what is on the lens, or written over the picture.
+/// whole cells, and for the rest the straightened image is sampled between its own cells. A second
+/// mean keeps the image's cells: what is on the lens, or written over the picture.
 #[derive(Debug)]
 pub(super) struct Level {
     /// Side of a cell, px.
@@ -247,7 +247,7 @@ impl Level {
         OF_MEDIAN * median(&mut self.scratch) / self.spread
     }
 
-    /// Fills `reduced` from the next finer scale, or straightens it where it is given as the finest.
+    /// Fills `reduced` from the next finer scale; of the finest it is given, and is straightened.
     pub(super) fn reduce(
         &mut self,
         finer: Option<&Self>,
@@ -266,8 +266,8 @@ impl Level {
         }
     }
 
-    /// Takes in the image in `reduced` and `straight`, and learns it except where `known` covers it,
-    /// and in the image itself `known_in_image`.
+    /// Takes in the image in `reduced` and `straight`, and learns it except where `known` covers
+    /// it, and in the image itself `known_in_image`.
     pub(super) fn see(&mut self, moment: Moment, known: &[Cells], known_in_image: &[Cells]) {
         self.view = moment.view;
         stand_out(&self.reduced, &mut self.stands_out, &mut self.stand_out_scratch);

@@ -226,9 +226,9 @@ impl Detector {
         self.watched.clear();
     }
 
-    /// How the next image lies against the one in which the background was begun; one that is rolled
-    /// or zoomed too far against it begins the background anew. What is known of noise, chance and
-    /// targets is kept.
+    /// How the next image lies against the one in which the background was begun; one that is
+    /// rolled or zoomed too far against it begins the background anew. What is known of noise,
+    /// chance and targets is kept.
     fn view(&mut self, interval: f64, turned: SceneTurn) -> Straightening {
         self.views.note_turn(turned, interval);
         if self.views.is_bent_too_far() && self.images > 0 {

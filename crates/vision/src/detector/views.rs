@@ -15,8 +15,8 @@ const TURN_S: f64 = 0.2;
 /// camera that zooms in to twice the size begins five times anew instead of two, and finds nothing
 /// for a quarter of a second each time.
 const MOST_BENT: f64 = 0.25;
-/// Most zoom out, a share: what has come into view on all sides has no place in the background. With
-/// half of it a camera that zooms out by two begins fourteen times anew instead of seven.
+/// Most zoom out, a share: what has come into view on all sides has no place in the background.
+/// With half of it a camera that zooms out by two begins fourteen times anew instead of seven.
 const MOST_WIDER: f64 = 0.1;
 /// What has come into view less than this ago is not found, s: twice the warm-up, so that a
 /// candidate is begun by what is seen whole. With half of it what comes into a panning camera's
