@@ -5,7 +5,7 @@ use crossfix_correlation::Plane;
 
 use super::cells::{Cells, free_of};
 use super::filter::between;
-use super::level::Moment;
+use super::views::Moment;
 
 /// What stands out is on the lens if the mean of what has kept its place in the image lacks less of
 /// it than this share of what the background lacks. With half of it lines behind which the scene

@@ -8,6 +8,7 @@ use super::cells::{Cells, CellsInView, free_of};
 use super::filter::{SURROUNDINGS, StandOutScratch, between, halve, moved, resample, stand_out};
 use super::lens::OnLens;
 use super::straight::Straightening;
+use super::views::Moment;
 use crate::ImagePoint;
 use crate::noise::{OF_MEDIAN, median};
 use crate::scene_turn::SceneTurn;
@@ -59,20 +60,6 @@ const CONTRAST_SPREADS: f32 = 4.0;
 /// Range of the contrast: beyond it is another scene, or none. With half of the range a step of the
 /// exposure by two changes every edge.
 const CONTRASTS: [f32; 2] = [0.5, 2.0];
-
-/// Time and camera direction of an image, for the background.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Moment {
-    /// How the image lies against that in which the background was begun.
-    pub(super) view: Straightening,
-    /// How fast it turns, in the mean, px/s.
-    pub(super) turning_px_s: f64,
-    /// Time since the image before, s.
-    pub(super) interval: f64,
-    /// Weight of this image in the background.
-    pub(super) share: f32,
-    pub(super) is_first: bool,
-}
 
 /// One scale.
 ///

@@ -37,10 +37,10 @@ use candidates::{Candidate, Candidates};
 use cells::Cells;
 use common_motion::{CommonMotion, FoundTarget};
 use filter::halve;
-use level::{Level, Moment};
+use level::Level;
 use plots::Plot;
 use straight::Straightening;
-use views::Views;
+use views::{Moment, Views};
 use watched::Watched;
 
 /// Sides of the cells of the scales, px: what is found is two or three cells large, 4 to 48 px.

@@ -23,6 +23,20 @@ const MOST_WIDER: f64 = 0.1;
 /// view is found (reasoned, not measured).
 const COMES_S: f64 = 2.0 * WARM_UP_S;
 
+/// Time and camera direction of an image, for the background.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Moment {
+    /// How the image lies against that in which the background was begun.
+    pub(super) view: Straightening,
+    /// How fast it turns, in the mean, px/s.
+    pub(super) turning_px_s: f64,
+    /// Time since the image before, s.
+    pub(super) interval: f64,
+    /// Weight of this image in the background.
+    pub(super) share: f32,
+    pub(super) is_first: bool,
+}
+
 /// The images' views of the background.
 #[derive(Debug)]
 pub(super) struct Views {
