@@ -160,7 +160,7 @@ fn drones_are_followed_in_real_video() {
 #[test]
 fn drones_are_found_in_real_video_without_a_box() {
     let Some(data) = real_data() else { return };
-    // Most of the five tracks elsewhere in visible video are of cars.
+    // Most of the tracks elsewhere in visible video are of cars.
     for (prefix, found, boxes, tracks) in
         [("IR_DRONE", 0.90, 0.05, 2.0), ("V_DRONE", 0.80, 0.2, 2.0)]
     {
