@@ -66,3 +66,42 @@ impl OnLens {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::detector::straight::Straightening;
+    use crate::scene_turn::SceneTurn;
+
+    #[test]
+    fn what_keeps_its_place_is_on_the_lens_whether_bright_or_dark() {
+        let mut on_lens = OnLens::default();
+        for image in 0..60 {
+            // One thing is always bright, and one dark before what is bright; what is elsewhere
+            // passes.
+            let stands_out = Plane::from_fn(20, 20, |x, y| match [x, y] {
+                [5, 5] => 40.0,
+                [14, 5] => 40.0 * if image / 10 % 2 == 0 { 1.0 } else { -1.0 },
+                [x, 14] if x == image % 20 => 40.0,
+                _ => 0.0,
+            });
+            let moment = Moment {
+                view: Straightening::new(SceneTurn::none(), [40, 40]),
+                turning_px_s: 100.0,
+                interval: 1.0 / 30.0,
+                share: 0.01,
+                is_first: image == 0,
+            };
+            on_lens.learn(&stands_out, moment, &[]);
+        }
+        for (at, now, is_on_lens) in [
+            ([5.0, 5.0], 40.0, true),
+            ([5.0, 5.0], 100.0, false),
+            ([14.0, 5.0], 40.0, true),
+            ([14.0, 5.0], -40.0, true),
+            ([10.0, 14.0], 40.0, false),
+        ] {
+            assert_eq!(on_lens.explains(at, now, now), is_on_lens, "{at:?}: {now}");
+        }
+    }
+}
