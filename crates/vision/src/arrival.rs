@@ -51,8 +51,8 @@ const LIGHTER: [f64; 2] = [0.5, 2.0];
 /// counts as having changed a little.
 const STRAIGHT_PX: f64 = 0.2;
 /// Least share of the reference's energy that must lie in view, where the target was not before.
-/// With half of it contrasts are measured by an eighth of the energy, with eight times the whole's noise
-/// variance; with twice as much a slow target's pictures show nothing for longer.
+/// With half of it contrasts are measured by an eighth of the energy, with eight times the whole's
+/// noise variance; with twice as much a slow target's pictures show nothing for longer.
 const LEAST_FREE: f64 = 0.25;
 /// Fewest pixels from which anything follows. With half of it the two that are left are fitted
 /// exactly by brightness and contrast, and never change.

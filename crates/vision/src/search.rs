@@ -68,8 +68,9 @@ const NOISE_OF_CHANGE: f32 = 1.6;
 
 /// Least share of a target's box that is in view where it is found again: a search continues the
 /// image beyond its border by what is at it, and so makes the tip of a tree there as large as a
-/// target. With half of it a zoomed clip has one for its drone for 28 images in a row; as it is, a
-/// large drone that comes in slowly is found up to half a second later.
+/// target. With half of it what a corner of the image shows of one is enough; without it a zoomed
+/// clip has a tree for its drone for 28 images in a row. As it is, a large drone that comes in
+/// slowly is found up to half a second later.
 const LEAST_IN_VIEW: f64 = 0.5;
 
 /// A picture that is searched, the image or what has changed.
