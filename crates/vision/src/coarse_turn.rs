@@ -57,6 +57,10 @@ impl<'a> PictureLevel<'a> {
         self.pair.fit_near(self.in_pixels(start), self.in_pixels(expected), sd)
     }
 
+    fn fits_better(&self, turn: SceneTurn, than: SceneTurn) -> bool {
+        self.pair.fits_better(self.in_pixels(turn), self.in_pixels(than), Bar::TURNING)
+    }
+
     /// The turn of a fit that is better than another turn.
     fn if_better(&self, fit: PictureFit, than: SceneTurn, bar: Bar) -> Option<FoundTurn> {
         if fit.turn.zoom.abs().max(fit.turn.roll.abs()) > MOST_BENT {
@@ -101,6 +105,19 @@ pub(crate) fn turn_between(
     let start = by_coarse.map_or(guess, |fit| coarse.in_image(fit.turn));
     let turn = fine.and_then(|fine| fine.if_better(fine.fit_near(start, guess, sd)?, guess, bar));
     turn.or_else(|| coarse.if_better(by_coarse?, guess, bar))
+}
+
+/// Whether pictures of an image and of an older one fit better, by more than noise makes it, at one
+/// turn than at another: the fine ones, where there are any.
+pub(crate) fn fits_better(
+    now: &CoarsePictures,
+    then: &CoarsePictures,
+    turn: SceneTurn,
+    than: SceneTurn,
+) -> bool {
+    let fine = PictureLevel::new(&now.fine, &then.fine, FINENESS).map(PictureLevel::fine);
+    let level = fine.or_else(|| PictureLevel::new(&now.coarse, &then.coarse, COARSENESS));
+    level.is_some_and(|level| level.fits_better(turn, than))
 }
 
 #[cfg(test)]

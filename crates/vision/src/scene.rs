@@ -8,7 +8,7 @@ use crossfix_correlation::Plane;
 
 use crate::ImagePoint;
 use crate::coarse_picture::{COARSENESS, CoarsePictures, CoarseScratch};
-use crate::coarse_turn::{FoundTurn, turn_between};
+use crate::coarse_turn::{FoundTurn, fits_better, turn_between};
 use crate::crop::replace_invalid;
 use crate::jerk::RowGlance;
 use crate::registration::{LEAST_COMMON, PicturePair, STRIDE};
@@ -192,17 +192,20 @@ impl SceneMemory {
     fn turn_from(&mut self, before: SceneTurn, is_jerked: bool, since_s: f64) -> FoundTurn {
         let unknown = |turn: SceneTurn| FoundTurn { turn, is_significant: false };
         let seen = self.seen_near(before, since_s);
+        let near = seen.unwrap_or(unknown(before));
         // The picture shows a large turn only near a first guess, and that of a scene which is fine
         // or changes quickly not at all.
         if !is_jerked && (seen.is_some() || !self.is_turning()) {
-            return seen.unwrap_or(unknown(before));
+            return near;
         }
-        let Some(shift) = self.shift_since(since_s) else {
-            return seen.unwrap_or(unknown(before));
-        };
+        let step = near.turn.and_then(before.inverse());
+        let Some(shift) = self.shift_since(since_s, step) else { return near };
         let guess = SceneTurn::shift(shift).and_then(before);
-        let found = self.seen_near(guess, since_s).unwrap_or(unknown(guess));
-        FoundTurn { is_significant: true, ..found }
+        let far = self.seen_near(guess, since_s).unwrap_or(unknown(guess));
+        if self.shows_rather(near.turn, far.turn) {
+            return near;
+        }
+        FoundTurn { is_significant: true, ..far }
     }
 
     /// The turn against the newest picture, if it determines one near a first guess.
@@ -211,15 +214,26 @@ impl SceneMemory {
         turn_between(&self.coarse, then, guess, since_s, self.is_turning())
     }
 
+    /// Whether the newest picture shows one turn rather than another.
+    fn shows_rather(&self, turn: SceneTurn, than: SceneTurn) -> bool {
+        let newest = self.pictures.first();
+        newest.is_some_and(|then| fits_better(&self.coarse, &then.coarse, turn, than))
+    }
+
     /// Whether the camera has turned a moment ago.
     fn is_turning(&self) -> bool {
         self.turning_s > 0.0
     }
 
-    /// By how much the camera has turned since the image registered `since_s` seconds before, px.
-    fn shift_since(&mut self, since_s: f64) -> Option<[f64; 2]> {
+    /// By how much the camera has turned since the image registered `since_s` seconds before, px:
+    /// by another shift than near a first guess only if that fits better.
+    fn shift_since(&mut self, since_s: f64, guess: SceneTurn) -> Option<[f64; 2]> {
         let pair = PicturePair::successive(&self.sharp, &self.sharp_before, &mut self.sums)?;
-        let turn = pair.shift()?.map(|turn| f64::from(turn) * COARSENESS as f64);
+        let side = COARSENESS as f64;
+        let [x, y] =
+            [self.sharp.width(), self.sharp.height()].map(|n| (n as f64 * side - 1.0) / 2.0);
+        let near = guess.moves(ImagePoint { x, y }).map(|px| (px / side) as f32);
+        let turn = pair.shift(near)?.map(|turn| f64::from(turn) * side);
         (turn[0].hypot(turn[1]) > LEAST_TURN_PX.max(LEAST_TURN_PX_S * since_s)).then_some(turn)
     }
 

@@ -277,9 +277,17 @@ impl<'a> PicturePair<'a> {
         of(fit).better_by(&of(&self.fit_at(than)), bar)
     }
 
+    /// Whether the pictures fit better at one turn than at another, by the bar.
+    pub(crate) fn fits_better(&self, turn: PictureTurn, than: PictureTurn, bar: Bar) -> bool {
+        self.better_by(&self.fit_at(turn), than, bar).is_some()
+    }
+
     /// The shift since the image before, pixels, less than `FARTHEST` per axis. `None` where most
     /// of the image does not show it.
-    pub(crate) fn shift(&self) -> Option<[f32; 2]> {
+    ///
+    /// A scene of many like parts fits as well where it has shifted by one of them, or better, if
+    /// that is nearer to whole pixels: another shift than near `guess` must fit better than that.
+    pub(crate) fn shift(&self, guess: [f32; 2]) -> Option<[f32; 2]> {
         let whole = self.best_whole_shift()?;
         let start = PictureTurn::of_shift(whole);
         let fit = self.fit_near(start, start, 0.0)?;
@@ -289,6 +297,16 @@ impl<'a> PicturePair<'a> {
             fit.turn.shift.iter().zip(whole).all(|(at, whole)| (at - whole).abs() < NEAR_WHOLE);
         let after = if is_near { fit } else { self.fit_at(start) };
         let shift = after.turn.shift;
+        let guess = PictureTurn::of_shift(guess);
+        let nearer = self.fit_near(guess, guess, 0.0);
+        let is_other = |nearer: &PictureFit| {
+            nearer.turn.shift.iter().zip(shift).any(|(at, shift)| (at - shift).abs() > NEAR_WHOLE)
+        };
+        if let Some(nearer) = nearer.filter(is_other)
+            && !after.misfits(0.0).are_better_in_most(&nearer.misfits(0.0))
+        {
+            return None;
+        }
         // Compared with the opposite shift: between pixels noise alone fits better than on them,
         // and this one lies between them alike. Both about one change of brightness: about one of
         // its own, a sky that is too bright to show anything would fit better by rounding.
@@ -377,7 +395,7 @@ mod tests {
     }
 
     fn turn(now: &Plane, then: &Plane) -> Option<[f32; 2]> {
-        PicturePair::successive(now, then, &mut Vec::new()).unwrap().shift()
+        PicturePair::successive(now, then, &mut Vec::new()).unwrap().shift([0.0; 2])
     }
 
     #[test]
@@ -391,6 +409,24 @@ mod tests {
                 assert!(off.is_some_and(|off| off < 0.2), "{sides:?}, {way:?}: {found:?}");
             }
         }
+    }
+
+    /// A fence: it fits better where it has shifted by one of its posts, as that is by whole pixels.
+    #[test]
+    fn a_scene_of_like_parts_has_not_shifted_by_one_of_them() {
+        let fence = |right: f32, seed| {
+            let post = |x: usize| 8.0 * (TAU * (x as f32 + right) / 6.5).sin();
+            let tree = |x: usize| if x.abs_diff(60) < 4 { 3.0 } else { 0.0 };
+            let ground = |y: usize| 12.0 * (y as f32 / 5.0).sin();
+            noisy(Plane::from_fn(80, 60, |x, y| 100.0 + ground(y) + post(x) + tree(x)), 0.5, seed)
+        };
+        let (now, then) = (fence(0.5, 1), fence(0.0, 2));
+        let pair = PicturePair::successive(&now, &then, &mut Vec::new()).unwrap();
+        let by_a_post = pair.best_whole_shift().unwrap();
+        assert_eq!(by_a_post, [-6.0, 0.0]);
+        assert_eq!(pair.shift([0.5, 0.0]), None);
+        // It may as well have shifted by one where that is expected.
+        assert!(pair.shift(by_a_post).is_some());
     }
 
     #[test]
