@@ -274,7 +274,7 @@ fn bent(x: f64, y: f64, roll_rad: f64, zoom: f64) -> f64 {
 #[test]
 fn a_camera_that_rolls_or_zooms_finds_what_comes_and_nothing_else() {
     let rolls: Scene = |x, y, time_s| bent(x, y, 0.2 * (1.5 * time_s).sin(), 1.0);
-    // So far that the background is begun anew on the way in and out.
+    // So far that the background is fixed anew on the way in and out.
     let zooms: Scene = |x, y, time_s| bent(x, y, 0.0, 1.25 + 0.25 * (1.5 * time_s).sin());
     for scene in [rolls, zooms] {
         let mut world = World::new(320, 240, 2.0, scene, 24);
@@ -376,8 +376,9 @@ fn found_of_reticle(stands_out: bool) -> usize {
         clouds(x + turned, y, 0.0) + 20.0 * ((x + turned) * 0.4).sin() * (y * 0.5).cos()
     }
     let mut world = World::new(320, 240, 2.0, turning, 23);
+    // It begins where the scene has been in view for a second, and parts from it slowly.
     let spot = |time_s: f64| Spot {
-        x: 300.0 - 50.0 * (time_s - 2.0),
+        x: 280.0 - 50.0 * (time_s - 2.0),
         y: 140.0,
         spread: [4.0, 3.0],
         brighter: 100.0,

@@ -151,8 +151,6 @@ pub(super) struct Candidate {
     pub(super) gone_px: f64,
     /// ... and in the image.
     pub(super) gone_in_image_px: f64,
-    /// How far the scene has turned fast since then, px.
-    pub(super) turned_fast_px: f64,
 }
 
 impl Candidate {
@@ -172,7 +170,6 @@ impl Candidate {
             first_in_image: plot.place,
             gone_px: 0.0,
             gone_in_image_px: 0.0,
-            turned_fast_px: 0.0,
         }
     }
 
@@ -334,20 +331,13 @@ impl Candidates {
     /// Associates the plots of the next image: each candidate takes the nearest free plot in its
     /// gate, and the plots that are left begin candidates and count as clutter. `turned_fast_px` is
     /// how far the scene has turned since the image before if it turns fast.
-    pub(super) fn step(
-        &mut self,
-        plots: &[Plot],
-        turned_fast_px: f64,
-        interval: f64,
-        sides: [usize; 2],
-    ) {
+    pub(super) fn step(&mut self, plots: &[Plot], interval: f64, sides: [usize; 2]) {
         self.clutter.fit(sides);
         let gate = Gate::with_probability(TARGET.in_gate);
         let mut is_free = vec![true; plots.len()];
         // The likeliest candidates choose first: the list is sorted.
         for candidate in &mut self.list {
             candidate.axes.iter_mut().for_each(|axis| axis.time_update(interval));
-            candidate.turned_fast_px += turned_fast_px;
             let near = plots
                 .iter()
                 .enumerate()
@@ -394,7 +384,6 @@ impl Candidates {
             candidate.first = [0, 1].map(|i| candidate.axes[i].position());
             candidate.first_in_image = candidate.plot.place;
             (candidate.gone_px, candidate.gone_in_image_px) = (0.0, 0.0);
-            candidate.turned_fast_px = 0.0;
         }
     }
 

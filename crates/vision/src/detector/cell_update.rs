@@ -21,6 +21,7 @@ pub(super) fn slope_squared([left, right]: [f32; 2], [above, below]: [f32; 2]) -
 /// One image's update of the background's cells.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct CellUpdate {
+    /// Least weight of this image: that of a background which forgets exponentially.
     pub(super) share: f32,
     pub(super) noise: f32,
     pub(super) sway: f32,
@@ -34,6 +35,7 @@ pub(super) struct BackgroundRow<'a> {
     pub(super) textures: &'a [f32],
     pub(super) mean: &'a mut [f32],
     pub(super) variance: &'a mut [f32],
+    pub(super) images: &'a mut [f32],
     pub(super) change: &'a mut [f32],
 }
 
@@ -57,17 +59,26 @@ impl CellUpdate {
     pub(super) fn learn(self, row: BackgroundRow<'_>) {
         let Self { share, noise, contrast, .. } = self;
         Arch::new().dispatch(|| {
-            let learnt = row.mean.iter_mut().zip(row.variance).zip(row.change);
-            for (((mean, variance), change), (now, texture)) in
+            let learnt = row.mean.iter_mut().zip(row.variance).zip(row.images).zip(row.change);
+            for ((((mean, variance), images), change), (now, texture)) in
                 learnt.zip(row.now.iter().zip(row.textures))
             {
+                let is_new = *images == 0.0;
+                // A young cell is the plain mean of its images, an old one forgets exponentially.
+                let share = share.max((*images + 1.0).recip());
+                let off = if is_new { 0.0 } else { now - contrast * *mean };
                 // In standard deviations; mean and variance learn from it with a limit on outliers.
-                let off = now - contrast * *mean;
                 let usual = variance.max(noise);
-                *change = off / (usual + texture).sqrt();
+                *change = off / (usual * (1.0 + images.max(1.0).recip()) + texture).sqrt();
                 let most = (OUTLYING * usual).sqrt();
-                *mean += share * off.clamp(-most, most);
-                *variance += share * ((off * off).min(OUTLYING * usual) - *variance);
+                *mean =
+                    if is_new { now / contrast } else { *mean + share * off.clamp(-most, most) };
+                *variance = if is_new {
+                    0.0
+                } else {
+                    *variance + share * ((off * off).min(OUTLYING * usual) - *variance)
+                };
+                *images += 1.0;
             }
         });
     }

@@ -36,11 +36,25 @@ pub(super) struct CellsInView {
 }
 
 impl CellsInView {
-    /// Notes which cells of a scale, with cells of `cell` px, a view shows.
-    pub(super) fn see(&mut self, view: Straightening, [width, height]: [usize; 2], cell: usize) {
-        (self.are_all, self.width) = (view.is_none(), width);
+    /// Notes which cells of a scale, with cells of `cell` px, a view shows, but for a margin, cells.
+    pub(super) fn see(
+        &mut self,
+        view: Straightening,
+        [width, height]: [usize; 2],
+        cell: usize,
+        margin: usize,
+    ) {
+        (self.are_all, self.width) = (view.is_none() && margin == 0, width);
+        let inner = |count: usize| margin..count.saturating_sub(margin).max(margin);
         self.rows.clear();
-        self.rows.extend((0..height).map(|row| view.cells_in_view(row, width, cell)));
+        self.rows.extend((0..height).map(|row| {
+            if !inner(height).contains(&row) {
+                return 0..0;
+            }
+            let (shown, inner) = (view.cells_in_view(row, width, cell), inner(width));
+            let from = shown.start.max(inner.start);
+            from..shown.end.min(inner.end).max(from)
+        }));
     }
 
     /// Whether a cell is in view, by its number among all.

@@ -138,6 +138,33 @@ pub(super) fn moved(from: &Plane, [right, down]: [isize; 2], to: &mut Plane) {
     }
 }
 
+/// Sets the cells to 0 that have come from beyond the border when the plane was moved.
+pub(super) fn clear_beyond(plane: &mut Plane, [right, down]: [isize; 2]) {
+    let (width, height) = (plane.width() as isize, plane.height() as isize);
+    for y in 0..height {
+        let row = plane.row_mut(y as usize);
+        let is_in = (0..height).contains(&(y + down));
+        let from = if is_in { (-right).clamp(0, width) } else { width };
+        let to = if is_in { (width - right).clamp(0, width) } else { width };
+        row[..from as usize].fill(0.0);
+        row[(to as usize).max(from as usize)..].fill(0.0);
+    }
+}
+
+/// Sets the cells to 0 that are within `reach` cells of the border.
+pub(super) fn clear_border(plane: &mut Plane, reach: usize) {
+    let (width, height) = (plane.width(), plane.height());
+    for y in 0..height {
+        let row = plane.row_mut(y);
+        if y < reach || y + reach >= height {
+            row.fill(0.0);
+        } else {
+            row[..reach.min(width)].fill(0.0);
+            row[width.saturating_sub(reach)..].fill(0.0);
+        }
+    }
+}
+
 /// The value at a place between the cells, linearly interpolated; beyond the border the border
 /// cells are repeated.
 pub(super) fn between(plane: &Plane, [x, y]: [f64; 2]) -> f32 {

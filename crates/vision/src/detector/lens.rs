@@ -44,10 +44,11 @@ impl OnLens {
     /// background's cells, which lie within a cell of the image's. Known targets are painted over,
     /// so that their edges are as empty as they.
     pub(super) fn learn(&mut self, stands_out: &Plane, moment: Moment, known: &[Cells]) {
-        let Moment { share, is_first, turning_px_s, interval, .. } = moment;
+        let Moment { share, images, turning_px_s, interval, .. } = moment;
         let passed = (turning_px_s * interval / LENS_PX).min(interval / LENS_S);
-        let share = share.max(1.0 - (-passed).exp() as f32);
-        if is_first {
+        let young = 1.0 / (images as f32 + 1.0);
+        let share = share.max(young).max(1.0 - (-passed).exp() as f32);
+        if images == 0 {
             self.mean.copy_from(stands_out);
             self.size.copy_from(stands_out);
             self.size.samples_mut().iter_mut().for_each(|size| *size = size.abs());
@@ -90,7 +91,7 @@ mod tests {
                 turning_px_s: 100.0,
                 interval: 1.0 / 30.0,
                 share: 0.01,
-                is_first: image == 0,
+                images: image as u32,
             };
             on_lens.learn(&stands_out, moment, &[]);
         }

@@ -3,15 +3,16 @@
 
 use crossfix_correlation::{Plane, Resampler};
 
-use super::cell_update::{BackgroundRow, CellUpdate, OUTLYING, slope_squared};
-use super::cells::{Cells, CellsInView, free_of};
-use super::filter::{SURROUNDINGS, StandOutScratch, between, halve, moved, resample, stand_out};
+use super::WARM_UP_IMAGES;
+use super::background::Background;
+use super::cell_update::{CellUpdate, OUTLYING, slope_squared};
+use super::cells::Cells;
+use super::filter::{SURROUNDINGS, StandOutScratch, halve, stand_out};
 use super::lens::OnLens;
 use super::straight::Straightening;
 use super::views::Moment;
 use crate::ImagePoint;
 use crate::noise::{OF_MEDIAN, median};
-use crate::scene_turn::SceneTurn;
 
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a
 /// level, and with half of it each such step is two standard deviations.
@@ -63,9 +64,8 @@ const CONTRASTS: [f32; 2] = [0.5, 2.0];
 
 /// One scale.
 ///
-/// The background's cells are fixed to the scene: when the camera turns they move over the image by
-/// whole cells, and for the rest the straightened image is sampled between its own cells. A second
-/// mean keeps the image's cells: what is on the lens, or written over the picture.
+/// The [`Background`]'s cells are fixed to the scene. A second mean keeps the image's cells: what is
+/// on the lens, or written over the picture.
 #[derive(Debug)]
 pub(super) struct Level {
     /// Side of a cell, px.
@@ -77,20 +77,10 @@ pub(super) struct Level {
     stand_out_scratch: StandOutScratch,
     /// By how much the background's cells stand out in this image, levels.
     pub(super) now: Plane,
-    /// Mean and variance of `now` over the last seconds.
-    mean: Plane,
-    variance: Plane,
+    background: Background,
     on_lens: OnLens,
     /// Change of this image from the mean, standard deviations; 0 where a known target is.
     pub(super) change: Plane,
-    /// How this image lies against that in which the background was begun, and which of a row's
-    /// cells are in view.
-    view: Straightening,
-    in_view: CellsInView,
-    /// Shift of the background against the straightened image, cells: the whole ones, and the
-    /// rest.
-    whole: [isize; 2],
-    rest: [f32; 2],
     /// Contrast of the background in this image, as a multiple of that in the mean.
     contrast: f32,
     /// Standard deviation of this image's changes where nothing comes, levels.
@@ -115,17 +105,12 @@ impl Level {
             cell,
             reduced: Plane::default(),
             straight: Plane::default(),
-            view: Straightening::new(SceneTurn::none(), [0; 2]),
-            in_view: CellsInView::default(),
             stands_out: Plane::default(),
             stand_out_scratch: StandOutScratch::default(),
             now: Plane::default(),
-            mean: Plane::default(),
-            variance: Plane::default(),
+            background: Background::new(cell),
             on_lens: OnLens::default(),
             change: Plane::default(),
-            whole: [0; 2],
-            rest: [0.0; 2],
             contrast: 1.0,
             spread: LEAST_SPREAD,
             sway: (FIRST_SWAY_PX / cell as f32).powi(2),
@@ -137,10 +122,15 @@ impl Level {
         }
     }
 
-    /// Forgets the background, and keeps what is known of the image's noise and of the sway.
-    pub(super) fn begin_anew(&mut self) {
-        let (persistence, sway) = (self.persistence, self.sway);
-        *self = Self { persistence, sway, ..Self::new(self.cell) };
+    /// The background.
+    pub(super) fn background(&self) -> &Background {
+        &self.background
+    }
+
+    /// Fixes the background to the image itself that lies against it as a view says. It counts as
+    /// learnt from at most `most_images`: a scene that is zoomed stands out of other surroundings.
+    pub(super) fn fix_to(&mut self, view: Straightening, most_images: f32) {
+        self.background.fix_to(view, most_images);
     }
 
     /// Side of a cell, px.
@@ -158,34 +148,9 @@ impl Level {
         self.is_lost
     }
 
-    /// Where the middle of a background's cell is in the image, px, and where that was when the
-    /// background was begun.
-    pub(super) fn place_of(&self, cell: [f64; 2]) -> (ImagePoint, [f64; 2]) {
-        let side = self.cell as f64;
-        let [x, y] = [0, 1].map(|i| (cell[i] - f64::from(self.rest[i]) + 0.5) * side - 0.5);
-        let straight = ImagePoint { x, y };
-        (self.view.in_image(straight), self.view.in_scene(straight))
-    }
-
-    /// A place of the straightened image in the background's cells, whose middles are the whole
-    /// numbers.
-    fn cell_of(&self, ImagePoint { x, y }: ImagePoint) -> [f64; 2] {
-        let place = [x, y];
-        [0, 1].map(|i| (place[i] + 0.5) / self.cell as f64 - 0.5 + f64::from(self.rest[i]))
-    }
-
-    /// The background's cells in which what has its corners at these places of the straightened
-    /// image is.
-    pub(super) fn cells_between(&self, corners: [ImagePoint; 2]) -> Cells {
-        let [first, last] = corners.map(|corner| self.cell_of(corner).map(f64::round));
-        let range =
-            |axis: usize| [first[axis].max(0.0) as usize, (last[axis] + 1.0).max(0.0) as usize];
-        Cells { columns: range(0), rows: range(1) }
-    }
-
     /// By how much the background is expected to stand out at a place of this image, levels.
-    pub(super) fn background(&self, place: ImagePoint) -> f32 {
-        self.contrast * between(&self.mean, self.cell_of(self.view.straight(place)))
+    pub(super) fn expected(&self, place: ImagePoint) -> f32 {
+        self.contrast * self.background.mean_at(place)
     }
 
     /// Share of what stands out at a cell that is new: 1 if the background has nothing there, 0 if
@@ -193,19 +158,19 @@ impl Level {
     pub(super) fn new_share(&self, [x, y]: [usize; 2]) -> f32 {
         let now = self.now.row(y)[x];
         // (now - c mean) / now, with c the contrast of this image.
-        if now == 0.0 { 0.0 } else { 1.0 - self.contrast * self.mean.row(y)[x] / now }
+        if now == 0.0 { 0.0 } else { 1.0 - self.contrast * self.background.mean.row(y)[x] / now }
     }
 
     /// Whether what stands out at a cell is on the lens, or written over the picture: what has kept
     /// its place in the image explains it, and the background does not. False while the camera has
-    /// not turned: the two are the same then, but for the light and the limit on outliers.
+    /// never turned: the two are the same then, but for the light and the limit on outliers.
     pub(super) fn is_on_lens(&self, [x, y]: [usize; 2]) -> bool {
-        if (self.whole, self.rest) == ([0; 2], [0.0; 2]) && self.view.is_none() {
+        if !self.background.has_moved() {
             return false;
         }
         let now = self.now.row(y)[x];
-        let excess = now - self.contrast * self.mean.row(y)[x];
-        let (place, _) = self.place_of([x, y].map(|at| at as f64));
+        let excess = now - self.contrast * self.background.mean.row(y)[x];
+        let (place, _) = self.background.place_of([x, y].map(|at| at as f64));
         let at = [place.x, place.y].map(|at| (at + 0.5) / self.cell as f64 - 0.5);
         self.on_lens.explains(at, now, excess)
     }
@@ -256,58 +221,37 @@ impl Level {
     /// Takes in the image in `reduced` and `straight`, and learns it except where `known` covers
     /// it, and in the image itself `known_in_image`.
     pub(super) fn see(&mut self, moment: Moment, known: &[Cells], known_in_image: &[Cells]) {
-        self.view = moment.view;
+        let Moment { view, images, .. } = moment;
         stand_out(&self.reduced, &mut self.stands_out, &mut self.stand_out_scratch);
         self.on_lens.learn(&self.stands_out, moment, known_in_image);
-        if !self.view.is_none() {
+        if !view.is_none() {
             stand_out(&self.straight, &mut self.stands_out, &mut self.stand_out_scratch);
         }
-        self.turn(moment);
-        self.in_view.see(self.view, [self.now.width(), self.now.height()], self.cell);
-        if moment.is_first {
-            self.mean.copy_from(&self.now);
-            self.variance.reshape(self.now.width(), self.now.height());
-            self.variance.samples_mut().fill(0.0);
+        if images == 0 {
+            self.background.begin([self.stands_out.width(), self.stands_out.height()]);
         }
-        if !moment.is_first {
-            self.compare(moment.interval, known);
+        self.background.turn_to(view);
+        self.background.sample(&mut self.stands_out, &mut self.now);
+        if images > 0 {
+            self.compare(moment, known);
         }
         self.learn(moment.share, known);
         self.remember_changes();
     }
 
-    /// Moves the background with the scene.
-    fn turn(&mut self, Moment { view, is_first, .. }: Moment) {
-        let cells = view.shift().map(|shift| shift / self.cell as f64);
-        // The background moves by whole cells: interpolated at every turn it would be blurred more
-        // and more. The image is interpolated instead, by the rest, and only once.
-        let whole = cells.map(|cells| cells.round() as isize);
-        self.rest = [0, 1].map(|i| (cells[i] - whole[i] as f64) as f32);
-        if self.rest == [0.0; 2] {
-            std::mem::swap(&mut self.now, &mut self.stands_out);
-        } else {
-            // The background's cell i lies at i - rest in the image's cells.
-            resample(&self.stands_out, self.rest.map(|rest| -rest), &mut self.now);
-        }
-        let by = [0, 1].map(|i| whole[i] - self.whole[i]);
-        if !is_first && by != [0, 0] {
-            for plane in [&mut self.mean, &mut self.variance] {
-                moved(plane, by, &mut self.change);
-                std::mem::swap(plane, &mut self.change);
-            }
-        }
-        self.whole = whole;
-    }
-
     /// Estimates the light, the noise and the sway from this image's changes.
-    fn compare(&mut self, interval: f64, known: &[Cells]) {
+    fn compare(&mut self, moment: Moment, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
         let step = sampling_step(width * height);
         // Contrast c: the median of now / mean over the cells that stand out.
+        let least_images = moment.images.min(WARM_UP_IMAGES) as f32;
+        let background = &self.background;
         let cells = || {
-            let cells = self.mean.samples().iter().zip(self.now.samples()).enumerate();
-            let sampled = cells.step_by(step).filter(|(i, _)| self.in_view.hold(*i));
-            sampled.map(|(_, cell)| cell)
+            let cells = background.mean.samples().iter().zip(self.now.samples()).enumerate();
+            cells
+                .step_by(step)
+                .filter(|(i, _)| background.is_known(*i, least_images))
+                .map(|(_, cell)| cell)
         };
         self.scratch.clear();
         self.scratch.extend(
@@ -325,19 +269,20 @@ impl Level {
         self.scratch.clear();
         self.scratch.extend(cells().map(|(mean, now)| (now - self.contrast * mean).abs()));
         self.spread = (OF_MEDIAN * median(&mut self.scratch)).max(LEAST_SPREAD);
-        self.estimate_sway(interval, known);
+        self.estimate_sway(moment, known);
     }
 
     /// Estimates the scene's sway: solves change^2 = sway slope^2 + usual variance, over the
     /// textured cells together.
-    fn estimate_sway(&mut self, interval: f64, known: &[Cells]) {
+    fn estimate_sway(&mut self, moment: Moment, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
         let step = sampling_step(width * height);
         let (mut slopes, mut changes, mut textured, mut changed) = (0.0_f32, 0.0_f32, 0, 0);
         // Squared, in cells: a sway of variance w changes a cell of slope g by the variance w g^2.
         let [least, most] = SWAY_PX.map(|px| (px / self.cell as f32).powi(2));
         let probe = (PROBE_PX / self.cell as f32).powi(2);
-        let mean = self.mean.samples();
+        let least_images = moment.images.min(WARM_UP_IMAGES) as f32;
+        let mean = self.background.mean.samples();
         let noise = self.spread * self.spread;
         for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
             if i % width == 0 || i % width == width - 1 {
@@ -348,10 +293,10 @@ impl Level {
             // A cell shows the sway only if a sway of `PROBE_PX` changes it by more than noise
             // does, and if no known target can stand out there.
             if probe * slope > noise
-                && self.in_view.hold(i)
+                && self.background.is_known(i, least_images)
                 && !known.iter().any(|cells| cells.are_near([i % width, i / width]))
             {
-                let usual = self.variance.samples()[i].max(noise);
+                let usual = self.background.variance.samples()[i].max(noise);
                 let expected = probe * slope + usual;
                 let change = self.now.samples()[i] - self.contrast * mean[i];
                 textured += 1;
@@ -371,7 +316,7 @@ impl Level {
             (FIRST_SWAY_PX / self.cell as f32).powi(2)
         };
         // A camera that is shaken is believed at once, one that is still only later.
-        let share = 1.0 - (-interval / STILL_AGAIN_S).exp() as f32;
+        let share = 1.0 - (-moment.interval / STILL_AGAIN_S).exp() as f32;
         self.sway = sway.max(self.sway + share * (sway - self.sway));
         let sways_too_far = self.sway_px() >= 0.99 * f64::from(SWAY_PX[1]);
         self.is_lost =
@@ -380,35 +325,13 @@ impl Level {
 
     /// Converts the changes to standard deviations, and learns the background.
     fn learn(&mut self, share: f32, known: &[Cells]) {
-        let (width, height) = (self.now.width(), self.now.height());
-        self.change.reshape(width, height);
         let update = CellUpdate {
             share,
             noise: self.spread * self.spread,
             sway: self.sway,
             contrast: self.contrast,
         };
-        for y in 0..height {
-            let (above, below) =
-                (self.mean.row(y.saturating_sub(1)), self.mean.row((y + 1).min(height - 1)));
-            update.textures(above, self.mean.row(y), below, &mut self.scratch);
-            let change = self.change.row_mut(y);
-            change.fill(0.0);
-            let in_view = self.in_view.of_row(y);
-            for [from, to] in free_of(known, y, width) {
-                let (from, to) = (from.max(in_view.start), to.min(in_view.end));
-                if from >= to {
-                    continue;
-                }
-                update.learn(BackgroundRow {
-                    now: &self.now.row(y)[from..to],
-                    textures: &self.scratch[from..to],
-                    mean: &mut self.mean.row_mut(y)[from..to],
-                    variance: &mut self.variance.row_mut(y)[from..to],
-                    change: &mut change[from..to],
-                });
-            }
-        }
+        self.background.learn(&self.now, update, known, &mut self.change);
     }
 
     /// Updates the persistence: how much of the changes lasts from image to image.
@@ -442,45 +365,94 @@ fn sampling_step(cells: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene_turn::SceneTurn;
 
-    /// Sky above waves, seen by a camera that has turned by `turned` pixels and is shaken.
-    fn see_waves(level: &mut Level, turned: [f64; 2], is_first: bool, shaken: f64) {
+    const SIDES: [usize; 2] = [160, 120];
+
+    /// Sky above waves, before a camera that has turned since the beginning, and since the
+    /// background was fixed, and is shaken by so much beside that.
+    fn see_waves(level: &mut Level, turned: [SceneTurn; 2], images: u32, shaken: f64) {
         let side = level.cell() as f64;
-        level.reduced = Plane::from_fn(80, 60, |x, y| {
-            let [right, down] = [x as f64 * side + turned[0] + shaken, y as f64 * side + turned[1]];
-            let waves = 20.0 * (right / 4.0).sin() * (down / 5.0).cos();
+        let [since_begun, since_fixed] = turned;
+        let middle = |at: usize| (at as f64 + 0.5) * side - 0.5;
+        let [width, height] = SIDES.map(|n| n / level.cell());
+        level.reduced = Plane::from_fn(width, height, |x, y| {
+            let ImagePoint { x, y } = since_begun.place(ImagePoint { x: middle(x), y: middle(y) });
+            let waves = 20.0 * ((x + shaken) / 4.0).sin() * (y / 5.0).cos();
             // Sky above: there nothing sways.
-            if down < 72.0 { 0.0 } else { waves as f32 }
+            if y < 72.0 { 0.0 } else { waves as f32 }
         });
-        let view = Straightening::new(SceneTurn::shift(turned), [80, 60].map(|n| n * level.cell()));
-        let moment = Moment { view, turning_px_s: 0.0, interval: 1.0 / 30.0, share: 0.1, is_first };
+        let view = Straightening::new(since_fixed, SIDES);
+        let moment = Moment { view, turning_px_s: 0.0, interval: 1.0 / 30.0, share: 0.1, images };
+        level.reduce(None, view, &mut Resampler::default());
         level.see(moment, &[], &[]);
     }
 
     fn greatest_change(level: &Level) -> f32 {
-        let rows = (6..54).flat_map(|y| &level.change.row(y)[6..74]);
-        rows.fold(0.0, |most, change| most.max(change.abs()))
+        level.change.samples().iter().fold(0.0, |most, change| most.max(change.abs()))
     }
 
     #[test]
     fn a_scene_that_turns_with_the_camera_does_not_change() {
         let mut level = Level::new(2);
         for image in 0..40 {
-            let turned = [0.7 * f64::from(image), -0.4 * f64::from(image)];
-            see_waves(&mut level, turned, image == 0, 0.0);
+            let turned = SceneTurn::shift([0.7 * f64::from(image), -0.4 * f64::from(image)]);
+            see_waves(&mut level, [turned; 2], image, 0.0);
             assert!(greatest_change(&level) < 3.0, "image {image}: {}", greatest_change(&level));
         }
         assert!(level.sway_px() < 0.2, "{}", level.sway_px());
     }
 
     #[test]
+    fn what_comes_into_view_is_known_by_the_images_that_show_it_whole() {
+        let mut level = Level::new(2);
+        for image in 0..40 {
+            let turned = SceneTurn::shift([f64::from(image), 0.0]);
+            see_waves(&mut level, [turned; 2], image, 0.0);
+        }
+        // The scene moves left by a cell every second image, by 20 of 80 in all. What ends at 60 has
+        // its surroundings in view from image 9 on, what ends at 74 from image 37.
+        let learnt = |x: usize| {
+            (0..=40).rev().find(|images| level.background().has_learnt([x, 30], *images as f32))
+        };
+        let found = [10, 50, 60, 74, 78].map(learnt);
+        assert_eq!(found, [Some(40), Some(40), Some(31), Some(3), Some(0)]);
+    }
+
+    /// Before a camera that has rolled, and zoomed in or out.
+    #[test]
+    fn a_background_that_is_fixed_to_another_image_is_the_same_scene() {
+        for zoom in [-0.2, 0.2] {
+            let mut level = Level::new(2);
+            for image in 0..40 {
+                see_waves(&mut level, [SceneTurn::none(); 2], image, 0.0);
+            }
+            let [x, y] = SIDES.map(|side| (side as f64 - 1.0) / 2.0);
+            let turned = SceneTurn::about(ImagePoint { x, y }, [3.0, -2.0], zoom, 0.1);
+            level.fix_to(Straightening::new(turned, SIDES), 15.0);
+            see_waves(&mut level, [turned, SceneTurn::none()], 40, 0.0);
+            let (mut squares, mut known) = ([0.0; 2], 0);
+            for y in 0..60 {
+                for x in (0..80).filter(|x| level.background().has_learnt([*x, y], 15.0)) {
+                    let now = level.now.row(y)[x];
+                    let off = now * level.new_share([x, y]);
+                    squares = [squares[0] + now * now, squares[1] + off * off];
+                    known += 1;
+                }
+            }
+            let [all, off] = squares;
+            assert!(known > 2400 && off < 0.03 * all, "zoom {zoom}: {known}, {all}, {off}");
+        }
+    }
+
+    #[test]
     fn a_shaken_scene_sways_at_once_and_is_still_later() {
         let mut level = Level::new(2);
         for image in 0..60 {
-            see_waves(&mut level, [0.0; 2], image == 0, 0.0);
+            see_waves(&mut level, [SceneTurn::none(); 2], image, 0.0);
         }
         let still = level.sway_px();
-        see_waves(&mut level, [0.0; 2], false, 0.6);
+        see_waves(&mut level, [SceneTurn::none(); 2], 60, 0.6);
         assert!(still < 0.1 && level.sway_px() > 0.4, "{still}, {}", level.sway_px());
         assert!(greatest_change(&level) < 4.0, "{}", greatest_change(&level));
     }

@@ -15,6 +15,7 @@
 //! clips of a fixed camera, thermal and visible, each when its constant was chosen, so that only
 //! those of one comment compare; a frame is right with a box within 10 px.
 
+mod background;
 mod candidates;
 mod cell_update;
 mod cells;
@@ -53,6 +54,10 @@ const LEAST_CELLS: usize = 18;
 /// a mean of 4 images at first, at 30 per second, whose noise adds a quarter to the variance of the
 /// changes.
 const WARM_UP_S: f64 = 0.25;
+/// The same of a part of the scene that has come into a turning camera's view, s: the errors of the
+/// registration make its mean worse than that of a still one. With half of it one more track per minute is
+/// begun on the scene of such cameras.
+const COMES_S: f64 = 0.5;
 /// Fewest images from which the background is learnt before anything is found, whatever their rate.
 /// With half of it the background's own noise adds a half to the variance of the changes, in slow
 /// streams.
@@ -74,11 +79,6 @@ const SWAYS: f64 = 3.0;
 /// 90.6) and no more false ones, but a mast swings as far. With half of the second the noise of a
 /// plot's place counts as motion.
 const PLACE_ERRORS: f64 = 2.0;
-/// It has also moved by more than this share of what a scene without texture has turned meanwhile
-/// faster than [`FAST_TURN_PX_S`]: what is near moves farther in the image of a camera that is
-/// moved than what is far. With half of it posts that move a fifth farther than the clouds behind
-/// them are found.
-const PARALLAX: f64 = 0.3;
 /// Margin that is asked above the odds of chance, nats: the images of a minute are not as many
 /// chances as they seem, as noise, clouds and leaves of one image are those of the next. With 2
 /// (half of it) there are 2.3 and 3.8 false tracks per minute (thermal, visible) instead of 1.1
@@ -90,11 +90,6 @@ const LEAST_CHANCES: f64 = 600.0;
 /// Margin of a known target that is covered with it: a share of its sides, and px. With half of it
 /// rotors and shadows beyond the box are found as other targets.
 const COVER: [f64; 2] = [0.25, 2.0];
-/// A turn faster than this, px/s, counts for [`PARALLAX`]: in slower ones what is near has not gone
-/// far before it is known. With half of it what drifts in a slow pan is found later (reasoned, not
-/// measured).
-const FAST_TURN_PX_S: f64 = 120.0;
-
 /// A target that is followed already.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct KnownTarget {
@@ -226,30 +221,27 @@ impl Detector {
         self.watched.clear();
     }
 
-    /// How the next image lies against the one in which the background was begun; one that is
-    /// rolled or zoomed too far against it begins the background anew. What is known of noise,
-    /// chance and targets is kept.
+    /// How the next image lies against the one to which the background is fixed; if it is rolled or
+    /// zoomed too far against it, the background is fixed to it from now on.
     fn view(&mut self, interval: f64, turned: SceneTurn) -> Straightening {
         self.views.note_turn(turned, interval);
-        if self.views.is_bent_too_far() && self.images > 0 {
-            self.levels.iter_mut().for_each(Level::begin_anew);
-            (self.images, self.settled_s) = (0, 0.0);
-            (self.has_warmed, self.lost_s) = (false, 0.0);
-            self.candidates.clear();
-        }
         if self.images == 0 {
-            self.views.begin();
+            self.views.fix();
+        } else if self.views.is_bent_too_far() {
+            let (view, known) = (self.views.of_last(), known_images(self.images, interval));
+            self.levels.iter_mut().for_each(|level| level.fix_to(view, known));
+            // Their places are in the image to which it was fixed before.
+            self.candidates.clear();
+            self.views.fix();
         }
-        self.views.take()
+        self.views.of_last()
     }
 
     /// Takes the image into the background of every scale, except where known targets are.
     fn learn(&mut self, interval: f64, view: Straightening, known: &[KnownTarget]) {
-        // A young background is the plain mean of its images; an old one forgets exponentially.
-        let young = 1.0 / (f64::from(self.images) + 1.0);
-        let share = young.max(1.0 - (-interval / self.config.background_s).exp()) as f32;
+        let share = (1.0 - (-interval / self.config.background_s).exp()) as f32;
         let turning_px_s = self.views.turning_px_s();
-        let moment = Moment { view, turning_px_s, interval, share, is_first: self.images == 0 };
+        let moment = Moment { view, turning_px_s, interval, share, images: self.images };
         for index in 0..self.levels.len() {
             let (finer, rest) = self.levels.split_at_mut(index);
             let level = &mut rest[0];
@@ -265,15 +257,9 @@ impl Detector {
 
     /// Takes the image's plots into the candidates.
     fn plot(&mut self, interval: f64, known: &[KnownTarget]) {
-        plots::find(&mut self.levels, &mut self.plots);
-        let views = &self.views;
-        self.plots.retain(|plot| {
-            !known.iter().any(|known| touches(&known.place, plot))
-                && views.have_shown(plot.in_scene)
-        });
-        let px_s = self.views.turning_px_s();
-        let turned_fast_px = if px_s > FAST_TURN_PX_S { px_s * interval } else { 0.0 };
-        self.candidates.step(&self.plots, turned_fast_px, interval, self.sides);
+        plots::find(&mut self.levels, known_images(self.images, interval), &mut self.plots);
+        self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));
+        self.candidates.step(&self.plots, interval, self.sides);
     }
 
     /// Notes how known targets that the detector has found move.
@@ -324,13 +310,20 @@ impl Detector {
     }
 }
 
+/// Number of images from which a cell of the background is known, at this interval, when the
+/// background has been learnt from `images` of them.
+fn known_images(images: u32, interval: f64) -> f32 {
+    let known = (COMES_S / interval).max(f64::from(WARM_UP_IMAGES));
+    known.min(f64::from(images)) as f32
+}
+
 /// Whether a candidate is found: it has gone farther than the scene sways, and a target is likelier
 /// than chance by the log-likelihood ratio that is asked.
 fn is_found(candidate: &Candidate, sway_px: f64, asked: f64) -> bool {
-    // The ways in which what stays in its place seems to move: the scene sways, a plot's place is
-    // known to a cell over its strength only, and a turn moves what is near farther.
+    // The ways in which what stays in its place seems to move: the scene sways, and a plot's place
+    // is known to a cell over its strength only.
     let place_error = PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
-    let moved = SWAYS * sway_px + place_error + PARALLAX * candidate.turned_fast_px;
+    let moved = SWAYS * sway_px + place_error;
     candidate.plots >= LEAST_PLOTS
         && candidate.gone_px > moved
         // What is on the lens or written over the picture keeps its place there when the camera
@@ -350,7 +343,7 @@ fn covered(place: &PixelBox) -> [[f64; 2]; 2] {
 /// The cells of a scale's background that a known target covers, by its place in the straightened
 /// image.
 fn cells_of(level: &Level, place: &PixelBox) -> Cells {
-    level.cells_between(covered(place).map(|[x, y]| ImagePoint { x, y }))
+    level.background().cells_between(covered(place).map(|[x, y]| ImagePoint { x, y }))
 }
 
 /// Paints over a known target, so that it does not hide what is about it.

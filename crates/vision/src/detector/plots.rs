@@ -32,7 +32,7 @@ const MOST_PLOTS: usize = 200;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Plot {
     pub(super) place: ImagePoint,
-    /// Where that was when the background was begun.
+    /// Where that was in the image to which the background is fixed.
     pub(super) in_scene: [f64; 2],
     /// Whether it is brighter or darker than its surroundings.
     pub(super) is_brighter: bool,
@@ -75,8 +75,9 @@ impl Plot {
     }
 }
 
-/// The plots of an image, those that stand out most first.
-pub(super) fn find(levels: &mut [Level], plots: &mut Vec<Plot>) {
+/// The plots of an image, those that stand out most first, of cells that have been learnt from that
+/// many images at least.
+pub(super) fn find(levels: &mut [Level], least_images: f32, plots: &mut Vec<Plot>) {
     plots.clear();
     for (index, level) in levels.iter_mut().enumerate() {
         let side = level.change.width();
@@ -87,7 +88,8 @@ pub(super) fn find(levels: &mut [Level], plots: &mut Vec<Plot>) {
                 continue;
             }
             for x in 1..side.saturating_sub(1) {
-                if level.change.row(y)[x].abs() >= LEAST_CHANGE {
+                let is_large = level.change.row(y)[x].abs() >= LEAST_CHANGE;
+                if is_large && level.background().has_learnt([x, y], least_images) {
                     plots.extend(plot_at(level, index, [x, y]));
                 }
             }
@@ -128,7 +130,8 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
     {
         return None;
     }
-    let (place, in_scene) = level.place_of([0, 1].map(|axis| refined(&level.now, top, axis, sign)));
+    let (place, in_scene) =
+        level.background().place_of([0, 1].map(|axis| refined(&level.now, top, axis, sign)));
     // The measured texture contains the noise: one spread squared is subtracted.
     let texture = (level.texture_about(top).powi(2) - 1.0).max(0.0).sqrt();
     Some(Plot {

@@ -1,10 +1,11 @@
-//! The image as a camera would see it that has not rolled or zoomed since the background was begun,
-//! only turned: the background is fixed to such images.
+//! The image as a camera would see it that has not rolled or zoomed against the one to which the
+//! background is fixed, only turned: the background is fixed to such images.
 
 use std::ops::Range;
 
 use crossfix_correlation::{Plane, Resampler, View};
 
+use super::filter::SURROUNDINGS;
 use crate::scene_turn::SceneTurn;
 use crate::{ImagePoint, PixelBox};
 
@@ -13,7 +14,7 @@ use crate::{ImagePoint, PixelBox};
 /// half of it the noise of the registration blurs the images of a camera that only pans.
 const UNBENT_PX: f64 = 0.5;
 
-/// How an image lies against that in which the background was begun: what is at a place of it was
+/// How an image lies against that to which the background is fixed: what is at a place of it was
 /// at that place rolled and zoomed about the middle, and then shifted.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Straightening {
@@ -27,7 +28,7 @@ pub(super) struct Straightening {
 }
 
 impl Straightening {
-    /// By where what is in an image of these sides was when the background was begun.
+    /// By where what is in an image of these sides was in that to which the background is fixed.
     pub(super) fn new(turn: SceneTurn, sides: [usize; 2]) -> Self {
         let [x, y] = sides.map(|side| (side as f64 - 1.0) / 2.0);
         let middle = ImagePoint { x, y };
@@ -73,17 +74,10 @@ impl Straightening {
         self.unbent.place(straight)
     }
 
-    /// Where what is at a place of the straightened image was when the background was begun.
+    /// Where what is at a place of the straightened image was in that to which the background is
+    /// fixed.
     pub(super) fn in_scene(&self, straight: ImagePoint) -> [f64; 2] {
         [straight.x + self.shift[0], straight.y + self.shift[1]]
-    }
-
-    /// Whether what was at a place when the background was begun is in view.
-    pub(super) fn shows(&self, [x, y]: [f64; 2]) -> bool {
-        let straight = ImagePoint { x: x - self.shift[0], y: y - self.shift[1] };
-        let place = self.in_image(straight);
-        let is_within = |at: f64, side: usize| (0.0..=side as f64 - 1.0).contains(&at);
-        is_within(place.x, self.sides[0]) && is_within(place.y, self.sides[1])
     }
 
     /// Fills `to` with the straightened image's means over cells of `cell` px, from the image's.
@@ -103,8 +97,7 @@ impl Straightening {
         resampler.resample(from, View { x, y, scale, turn_rad }, to);
     }
 
-    /// The cells of a row, of `count` cells of `cell` px, whose middles are in view, a cell from
-    /// the border.
+    /// The cells of a row, of `count` cells of `cell` px, whose surroundings are in view.
     pub(super) fn cells_in_view(&self, row: usize, count: usize, cell: usize) -> Range<usize> {
         if self.is_none() {
             return 0..count;
@@ -116,8 +109,8 @@ impl Straightening {
         let axes = [(first.x, second.x, self.sides[0]), (first.y, second.y, self.sides[1])];
         // first + step column lies from one cell to a cell from the other side.
         for (first, second, side) in axes {
-            let (step, cell) = (second - first, cell as f64);
-            let bounds = [cell - first, side as f64 - 1.0 - cell - first];
+            let (step, margin) = (second - first, ((SURROUNDINGS + 1) * cell) as f64);
+            let bounds = [margin - first, side as f64 - 1.0 - margin - first];
             if step.abs() < 1e-9 {
                 if bounds[0] > 0.0 || bounds[1] < 0.0 {
                     return 0..0;
@@ -149,7 +142,6 @@ mod tests {
             assert!((x - was.x).hypot(y - was.y) < 1e-9, "{place:?}");
             let back = view.in_image(view.straight(place));
             assert!((back.x - place.x).hypot(back.y - place.y) < 1e-9, "{place:?}");
-            assert!(view.shows([x, y]));
         }
         // Cells of the straightened image show what lies there.
         let bright = |x: f64, y: f64| ((x / 9.0).sin() * (y / 11.0).cos()) as f32;

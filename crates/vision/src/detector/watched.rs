@@ -85,7 +85,7 @@ impl Watched {
         for watch in &mut self.0 {
             let level = &levels[watch.level];
             // What stands out now, less what the background without the target would show there.
-            let excess = watch.stands_out - level.background(watch.place);
+            let excess = watch.stands_out - level.expected(watch.place);
             let is_new = watch.stands_out.abs()
                 > STANDS_OUT * level.least_strength() * level.spread
                 && excess.abs() >= NEW * watch.stands_out.abs();
