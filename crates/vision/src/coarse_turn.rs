@@ -107,8 +107,8 @@ pub(crate) fn turn_between(
     turn.or_else(|| coarse.if_better(by_coarse?, guess, bar))
 }
 
-/// Whether pictures of an image and of an older one fit better, by more than noise makes it, at one
-/// turn than at another: the fine ones, where there are any.
+/// Whether pictures of an image and of an older one fit better at one turn than at another, by what
+/// is believed of a camera that turns: the fine ones, where there are any.
 pub(crate) fn fits_better(
     now: &CoarsePictures,
     then: &CoarsePictures,

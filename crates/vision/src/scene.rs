@@ -202,6 +202,8 @@ impl SceneMemory {
         let Some(shift) = self.shift_since(since_s, step) else { return near };
         let guess = SceneTurn::shift(shift).and_then(before);
         let far = self.seen_near(guess, since_s).unwrap_or(unknown(guess));
+        // The far turn was found from image to image: the picture, which may show nothing, only
+        // refuses it.
         if self.shows_rather(near.turn, far.turn) {
             return near;
         }

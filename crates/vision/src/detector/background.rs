@@ -3,6 +3,7 @@
 
 use crossfix_correlation::Plane;
 
+use super::WARM_UP_IMAGES;
 use super::cell_update::{BackgroundRow, CellUpdate};
 use super::cells::{Cells, CellsInView, free_of};
 use super::filter::{SURROUNDINGS, between, clear_beyond, clear_border, moved, resample};
@@ -10,11 +11,21 @@ use super::straight::Straightening;
 use crate::ImagePoint;
 use crate::scene_turn::SceneTurn;
 
+/// Cells at the border that are not learnt once the camera has turned: those whose surroundings are
+/// cut off. With half of it 1.3 more tracks per minute are begun on what comes into a panning
+/// thermal camera's view.
+pub(super) const MARGIN: usize = SURROUNDINGS;
+
+/// What has come into a turning camera's view is known after this time, s: twice the warm-up, as
+/// the errors of the registration make its mean worse than that of a still one. With half of it one
+/// more track per minute is begun on the scene of such cameras.
+const COMES_S: f64 = 0.5;
+
 /// What stands out of one scale of the scene, and how that varies.
 ///
 /// Its cells are fixed to the scene: when the camera turns they move over the image by whole cells,
-/// and for the rest the straightened image is sampled between its own cells. Each is known by the
-/// images that have shown it with all of its surroundings.
+/// and for the rest the straightened image is sampled between its own cells. From then on a cell is
+/// learnt only where all of its surroundings are in view.
 #[derive(Debug)]
 pub(super) struct Background {
     /// Side of a cell, px.
@@ -22,8 +33,9 @@ pub(super) struct Background {
     /// Mean and variance of by how much the cells stand out, levels.
     pub(super) mean: Plane,
     pub(super) variance: Plane,
-    /// From how many images each cell has been learnt.
-    images: Plane,
+    /// From how many images each cell has been learnt, and how many there were.
+    learnt_images: Plane,
+    images: f32,
     /// How the latest image lies against that to which the cells are fixed, and which of a row's
     /// cells are in view.
     view: Straightening,
@@ -31,7 +43,7 @@ pub(super) struct Background {
     /// Shift of the cells against the straightened image, in cells: the whole ones, and the rest.
     whole: [isize; 2],
     rest: [f32; 2],
-    /// Whether the scene has ever been turned.
+    /// Whether the cells have ever moved over the image.
     has_moved: bool,
     scratch: Plane,
     textures: Vec<f32>,
@@ -43,7 +55,8 @@ impl Background {
             cell,
             mean: Plane::default(),
             variance: Plane::default(),
-            images: Plane::default(),
+            learnt_images: Plane::default(),
+            images: 0.0,
             view: Straightening::new(SceneTurn::none(), [0; 2]),
             in_view: CellsInView::default(),
             whole: [0; 2],
@@ -56,15 +69,16 @@ impl Background {
 
     /// Begins it with so many cells, of which nothing is known.
     pub(super) fn begin(&mut self, [width, height]: [usize; 2]) {
-        for plane in [&mut self.mean, &mut self.variance, &mut self.images] {
+        self.images = 0.0;
+        for plane in [&mut self.mean, &mut self.variance, &mut self.learnt_images] {
             plane.reshape(width, height);
             plane.samples_mut().fill(0.0);
         }
     }
 
-    /// Whether the scene has ever been turned.
-    pub(super) fn has_moved(&self) -> bool {
-        self.has_moved
+    /// Whether the scene has turned since the background was begun.
+    pub(super) fn has_turned(&self) -> bool {
+        self.has_moved || self.rest != [0.0; 2] || !self.view.is_none()
     }
 
     /// Where the middle of a cell is in the image, px, and where that was in the image to which the
@@ -95,14 +109,23 @@ impl Background {
         between(&self.mean, self.cell_of(self.view.straight(place)))
     }
 
-    /// Whether a cell has been learnt from that many images.
+    /// Whether a cell has been learnt from at least so many images.
     pub(super) fn has_learnt(&self, [x, y]: [usize; 2], least_images: f32) -> bool {
-        self.images.row(y)[x] >= least_images
+        self.learnt_images.row(y)[x] >= least_images
     }
 
-    /// The same of a cell by its number, if it is in view.
-    pub(super) fn is_known(&self, cell: usize, least_images: f32) -> bool {
-        self.in_view.hold(cell) && self.images.samples()[cell] >= least_images
+    /// From how many images a cell must have been learnt to be known: those of [`COMES_S`], but a
+    /// few, or as many as there were.
+    pub(super) fn least_known(&self, usual_interval: f64) -> f32 {
+        let images = (COMES_S / usual_interval).max(f64::from(WARM_UP_IMAGES)) as f32;
+        images.min(self.images)
+    }
+
+    /// Whether a cell, by its number, is in view and has been learnt from a few images, or from all
+    /// that there were: what it changes by says something of the whole image.
+    pub(super) fn is_telling(&self, cell: usize) -> bool {
+        let least = (WARM_UP_IMAGES as f32).min(self.images);
+        self.in_view.hold(cell) && self.learnt_images.samples()[cell] >= least
     }
 
     /// Moves the cells to where the scene is in a view.
@@ -116,24 +139,25 @@ impl Background {
         (self.view, self.whole) = (view, whole);
         if !self.has_moved && (by != [0, 0] || !view.is_none()) {
             // What has been learnt at the border had its surroundings cut off by it.
-            clear_border(&mut self.images, SURROUNDINGS);
+            clear_border(&mut self.learnt_images, MARGIN);
             self.has_moved = true;
         }
         if by != [0, 0] {
-            for plane in [&mut self.mean, &mut self.variance, &mut self.images] {
+            for plane in [&mut self.mean, &mut self.variance, &mut self.learnt_images] {
                 moved(plane, by, &mut self.scratch);
                 std::mem::swap(plane, &mut self.scratch);
             }
-            clear_beyond(&mut self.images, by);
+            clear_beyond(&mut self.learnt_images, by);
         }
         let sides = [self.mean.width(), self.mean.height()];
-        let margin = if self.has_moved { SURROUNDINGS } else { 0 };
+        let margin = if self.has_moved { MARGIN } else { 0 };
         self.in_view.see(view, sides, self.cell, margin);
     }
 
-    /// Fixes it to the image itself that lies against it as a view says. It counts as learnt from at
-    /// most `most_images`: a scene that is zoomed stands out of other surroundings.
-    pub(super) fn fix_to(&mut self, view: Straightening, most_images: f32) {
+    /// From now on the cells are those of the image that this view is of. They count as learnt from
+    /// as many images as make them known: a scene that is zoomed stands out of other surroundings.
+    pub(super) fn fix_to(&mut self, view: Straightening, usual_interval: f64) {
+        let most = self.least_known(usual_interval);
         self.turn_to(view);
         let [width, height] = [self.mean.width(), self.mean.height()];
         let middle = |at: usize| (at as f64 + 0.5) * self.cell as f64 - 0.5;
@@ -141,19 +165,20 @@ impl Background {
         let was = |x: usize, y: usize| {
             self.cell_of(view.straight(ImagePoint { x: middle(x), y: middle(y) }))
         };
-        let images = Plane::from_fn(width, height, |x, y| {
-            let [column, row] = was(x, y).map(f64::round);
+        // As long as the youngest of the four cells between which it was; 0 beyond the border.
+        let learnt_images = Plane::from_fn(width, height, |x, y| {
+            let [first, last] = [f64::floor, f64::ceil].map(|round| was(x, y).map(round));
             let is_in = |at: f64, count: usize| (0.0..count as f64).contains(&at);
-            let was_in = is_in(column, width) && is_in(row, height);
-            if was_in {
-                self.images.row(row as usize)[column as usize].min(most_images)
-            } else {
-                0.0
-            }
+            let corners = [first, [first[0], last[1]], [last[0], first[1]], last];
+            let of = |[column, row]: [f64; 2]| {
+                let is_in = is_in(column, width) && is_in(row, height);
+                if is_in { self.learnt_images.row(row as usize)[column as usize] } else { 0.0 }
+            };
+            corners.map(of).into_iter().fold(most, f32::min)
         });
         let mean = Plane::from_fn(width, height, |x, y| between(&self.mean, was(x, y)));
         let variance = Plane::from_fn(width, height, |x, y| between(&self.variance, was(x, y)));
-        (self.images, self.mean, self.variance) = (images, mean, variance);
+        (self.learnt_images, self.mean, self.variance) = (learnt_images, mean, variance);
         (self.whole, self.rest, self.has_moved) = ([0; 2], [0.0; 2], true);
     }
 
@@ -169,7 +194,8 @@ impl Background {
     }
 
     /// Takes in by how much the cells stand out `now`, except those that `known` covers, and fills
-    /// `change` with how far that is from the mean, in standard deviations; 0 where it is not known.
+    /// `change` with how far that is from the mean, in standard deviations; 0 where it is not
+    /// known.
     pub(super) fn learn(
         &mut self,
         now: &Plane,
@@ -177,6 +203,7 @@ impl Background {
         known: &[Cells],
         change: &mut Plane,
     ) {
+        self.images += 1.0;
         let (width, height) = (now.width(), now.height());
         change.reshape(width, height);
         for y in 0..height {
@@ -196,10 +223,31 @@ impl Background {
                     textures: &self.textures[from..to],
                     mean: &mut self.mean.row_mut(y)[from..to],
                     variance: &mut self.variance.row_mut(y)[from..to],
-                    images: &mut self.images.row_mut(y)[from..to],
+                    learnt_images: &mut self.learnt_images.row_mut(y)[from..to],
                     change: &mut change[from..to],
                 });
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cell_is_known_after_half_a_second_and_a_few_images_or_as_many_as_there_were() {
+        for (images, interval, known) in [(100, 0.1, 5.0), (100, 1.0, 4.0), (3, 0.1, 3.0)] {
+            let mut background = Background::new(2);
+            background.begin([20, 20]);
+            background.turn_to(Straightening::new(SceneTurn::none(), [40, 40]));
+            let update = CellUpdate { share: 0.0, noise: 1.0, sway: 0.0, contrast: 1.0 };
+            let now = Plane::from_fn(20, 20, |_, _| 0.0);
+            for _ in 0..images {
+                background.learn(&now, update, &[], &mut Plane::default());
+            }
+            assert_eq!(background.least_known(interval), known);
+            assert!(background.has_learnt([10, 10], known), "what was always in view is");
         }
     }
 }

@@ -131,7 +131,7 @@ const CLUTTER: ClutterModel = ClutterModel { cell_px: 32.0, mean_s: 3.0, least: 
 
 /// A track of plots that may be a target.
 ///
-/// Its places are in the scene: as in the image in which the background was begun, whatever the
+/// Its places are in the scene: as in the image to which the background is fixed, whatever the
 /// camera has turned since.
 #[derive(Clone, Debug)]
 pub(super) struct Candidate {
@@ -329,8 +329,7 @@ impl Candidates {
     }
 
     /// Associates the plots of the next image: each candidate takes the nearest free plot in its
-    /// gate, and the plots that are left begin candidates and count as clutter. `turned_fast_px` is
-    /// how far the scene has turned since the image before if it turns fast.
+    /// gate, and the plots that are left begin candidates and count as clutter.
     pub(super) fn step(&mut self, plots: &[Plot], interval: f64, sides: [usize; 2]) {
         self.clutter.fit(sides);
         let gate = Gate::with_probability(TARGET.in_gate);

@@ -35,7 +35,7 @@ pub(super) struct BackgroundRow<'a> {
     pub(super) textures: &'a [f32],
     pub(super) mean: &'a mut [f32],
     pub(super) variance: &'a mut [f32],
-    pub(super) images: &'a mut [f32],
+    pub(super) learnt_images: &'a mut [f32],
     pub(super) change: &'a mut [f32],
 }
 
@@ -59,17 +59,20 @@ impl CellUpdate {
     pub(super) fn learn(self, row: BackgroundRow<'_>) {
         let Self { share, noise, contrast, .. } = self;
         Arch::new().dispatch(|| {
-            let learnt = row.mean.iter_mut().zip(row.variance).zip(row.images).zip(row.change);
-            for ((((mean, variance), images), change), (now, texture)) in
+            let learnt =
+                row.mean.iter_mut().zip(row.variance).zip(row.learnt_images).zip(row.change);
+            for ((((mean, variance), learnt_images), change), (now, texture)) in
                 learnt.zip(row.now.iter().zip(row.textures))
             {
-                let is_new = *images == 0.0;
+                let is_new = *learnt_images == 0.0;
                 // A young cell is the plain mean of its images, an old one forgets exponentially.
-                let share = share.max((*images + 1.0).recip());
+                let share = share.max((*learnt_images + 1.0).recip());
                 let off = if is_new { 0.0 } else { now - contrast * *mean };
                 // In standard deviations; mean and variance learn from it with a limit on outliers.
+                // The mean of n images has a variance of its own, an n-th of theirs.
                 let usual = variance.max(noise);
-                *change = off / (usual * (1.0 + images.max(1.0).recip()) + texture).sqrt();
+                let of_mean = usual * learnt_images.max(1.0).recip();
+                *change = off / (usual + of_mean + texture).sqrt();
                 let most = (OUTLYING * usual).sqrt();
                 *mean =
                     if is_new { now / contrast } else { *mean + share * off.clamp(-most, most) };
@@ -78,7 +81,7 @@ impl CellUpdate {
                 } else {
                     *variance + share * ((off * off).min(OUTLYING * usual) - *variance)
                 };
-                *images += 1.0;
+                *learnt_images += 1.0;
             }
         });
     }

@@ -36,7 +36,8 @@ pub(super) struct CellsInView {
 }
 
 impl CellsInView {
-    /// Notes which cells of a scale, with cells of `cell` px, a view shows, but for a margin, cells.
+    /// Notes which cells of a scale, with cells of `cell` px, a view shows, but for a margin,
+    /// cells.
     pub(super) fn see(
         &mut self,
         view: Straightening,

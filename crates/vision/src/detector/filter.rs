@@ -209,6 +209,17 @@ mod tests {
         assert!((to.row(5)[7] - (slope.row(5)[7] + 0.5 - 1.5)).abs() < 1e-4);
         moved(&slope, [2, -1], &mut to);
         assert_eq!(to.row(5)[7], slope.row(4)[9]);
+        // What has come from beyond the border: two columns on the right, and a row above.
+        clear_beyond(&mut to, [2, -1]);
+        for (x, y, is_clear) in [(17, 5, false), (18, 5, true), (7, 0, true), (7, 1, false)] {
+            assert_eq!(to.row(y)[x] == 0.0, is_clear, "({x}, {y})");
+        }
+        clear_beyond(&mut to, [-3, 2]);
+        for (x, y, is_clear) in [(2, 5, true), (3, 5, false), (7, 8, true), (7, 7, false)] {
+            assert_eq!(to.row(y)[x] == 0.0, is_clear, "({x}, {y})");
+        }
+        clear_beyond(&mut to, [-30, 0]);
+        assert!(to.samples().iter().all(|out| *out == 0.0));
         assert!((between(&slope, [3.5, 2.25]) - 13.75).abs() < 1e-4);
     }
 }

@@ -44,11 +44,10 @@ impl OnLens {
     /// background's cells, which lie within a cell of the image's. Known targets are painted over,
     /// so that their edges are as empty as they.
     pub(super) fn learn(&mut self, stands_out: &Plane, moment: Moment, known: &[Cells]) {
-        let Moment { share, images, turning_px_s, interval, .. } = moment;
+        let Moment { share, young, is_first, turning_px_s, interval, .. } = moment;
         let passed = (turning_px_s * interval / LENS_PX).min(interval / LENS_S);
-        let young = 1.0 / (images as f32 + 1.0);
         let share = share.max(young).max(1.0 - (-passed).exp() as f32);
-        if images == 0 {
+        if is_first {
             self.mean.copy_from(stands_out);
             self.size.copy_from(stands_out);
             self.size.samples_mut().iter_mut().for_each(|size| *size = size.abs());
@@ -91,7 +90,8 @@ mod tests {
                 turning_px_s: 100.0,
                 interval: 1.0 / 30.0,
                 share: 0.01,
-                images: image as u32,
+                young: 1.0 / (image as f32 + 1.0),
+                is_first: image == 0,
             };
             on_lens.learn(&stands_out, moment, &[]);
         }

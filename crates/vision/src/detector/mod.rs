@@ -54,14 +54,14 @@ const LEAST_CELLS: usize = 18;
 /// a mean of 4 images at first, at 30 per second, whose noise adds a quarter to the variance of the
 /// changes.
 const WARM_UP_S: f64 = 0.25;
-/// The same of a part of the scene that has come into a turning camera's view, s: the errors of the
-/// registration make its mean worse than that of a still one. With half of it one more track per minute is
-/// begun on the scene of such cameras.
-const COMES_S: f64 = 0.5;
 /// Fewest images from which the background is learnt before anything is found, whatever their rate.
 /// With half of it the background's own noise adds a half to the variance of the changes, in slow
 /// streams.
 const WARM_UP_IMAGES: u32 = 4;
+/// Weight of an interval in the running mean of them: one image that is left out, or comes late,
+/// hardly changes it. A second after a stream has fallen from 30 to 10 images per second, half a
+/// second is counted as 7 images (5 would be right); with half of this weight as 8.
+const INTERVALS: f64 = 0.1;
 /// A background that is still being learnt may look like another scene's for this long before it is
 /// begun anew, s: in a clear sky the first image's targets are all of its texture, and as they move
 /// on, that fades from the mean in 0.2 to 0.4 s (of 30 images per second; below 2 it is begun anew
@@ -90,6 +90,7 @@ const LEAST_CHANCES: f64 = 600.0;
 /// Margin of a known target that is covered with it: a share of its sides, and px. With half of it
 /// rotors and shadows beyond the box are found as other targets.
 const COVER: [f64; 2] = [0.25, 2.0];
+
 /// A target that is followed already.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct KnownTarget {
@@ -124,6 +125,8 @@ pub(crate) struct Detector {
     sides: [usize; 2],
     levels: Vec<Level>,
     images: u32,
+    /// Running mean of the time between images, s.
+    usual_interval: f64,
     /// How long the background has been learnt since another scene was in view, s.
     settled_s: f64,
     /// Whether that has been long enough once since it was begun, ...
@@ -147,6 +150,7 @@ impl Detector {
             sides: [0; 2],
             levels: Vec::new(),
             images: 0,
+            usual_interval: 0.0,
             settled_s: 0.0,
             has_warmed: false,
             lost_s: 0.0,
@@ -176,6 +180,9 @@ impl Detector {
             let fits = |cell: &&usize| self.sides.iter().all(|side| side / **cell >= LEAST_CELLS);
             self.levels = CELLS.iter().take_while(fits).map(|cell| Level::new(*cell)).collect();
         }
+        // Before the first image there is no interval.
+        let share = if self.images > 1 { INTERVALS } else { 1.0 };
+        self.usual_interval += share * (interval - self.usual_interval);
         self.note_known(interval, known);
         let view = self.view(interval, turned);
         let Some(finest) = self.levels.first_mut() else { return Findings::default() };
@@ -228,8 +235,8 @@ impl Detector {
         if self.images == 0 {
             self.views.fix();
         } else if self.views.is_bent_too_far() {
-            let (view, known) = (self.views.of_last(), known_images(self.images, interval));
-            self.levels.iter_mut().for_each(|level| level.fix_to(view, known));
+            let (view, usual_interval) = (self.views.of_last(), self.usual_interval);
+            self.levels.iter_mut().for_each(|level| level.fix_to(view, usual_interval));
             // Their places are in the image to which it was fixed before.
             self.candidates.clear();
             self.views.fix();
@@ -241,11 +248,13 @@ impl Detector {
     fn learn(&mut self, interval: f64, view: Straightening, known: &[KnownTarget]) {
         let share = (1.0 - (-interval / self.config.background_s).exp()) as f32;
         let turning_px_s = self.views.turning_px_s();
-        let moment = Moment { view, turning_px_s, interval, share, images: self.images };
+        let young = 1.0 / (self.images as f32 + 1.0);
+        let is_first = self.images == 0;
+        let moment = Moment { view, turning_px_s, interval, share, young, is_first };
         for index in 0..self.levels.len() {
             let (finer, rest) = self.levels.split_at_mut(index);
             let level = &mut rest[0];
-            level.reduce(finer.last(), view, &mut self.resampler);
+            level.take(finer.last(), moment, &mut self.resampler);
             let in_image = known.iter().map(|known| cells_of(level, &known.place));
             let in_image: Vec<Cells> = in_image.collect();
             let straight = known.iter().map(|known| view.straight_box(known.place));
@@ -257,7 +266,7 @@ impl Detector {
 
     /// Takes the image's plots into the candidates.
     fn plot(&mut self, interval: f64, known: &[KnownTarget]) {
-        plots::find(&mut self.levels, known_images(self.images, interval), &mut self.plots);
+        plots::find(&mut self.levels, self.usual_interval, &mut self.plots);
         self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));
         self.candidates.step(&self.plots, interval, self.sides);
     }
@@ -308,13 +317,6 @@ impl Detector {
         });
         found.filter(|found| !known.iter().any(|known| known.place.is_near(&found.place))).collect()
     }
-}
-
-/// Number of images from which a cell of the background is known, at this interval, when the
-/// background has been learnt from `images` of them.
-fn known_images(images: u32, interval: f64) -> f32 {
-    let known = (COMES_S / interval).max(f64::from(WARM_UP_IMAGES));
-    known.min(f64::from(images)) as f32
 }
 
 /// Whether a candidate is found: it has gone farther than the scene sways, and a target is likelier

@@ -75,11 +75,11 @@ impl Plot {
     }
 }
 
-/// The plots of an image, those that stand out most first, of cells that have been learnt from that
-/// many images at least.
-pub(super) fn find(levels: &mut [Level], least_images: f32, plots: &mut Vec<Plot>) {
+/// The plots of an image, those that stand out most first; images come `usual_interval` s apart.
+pub(super) fn find(levels: &mut [Level], usual_interval: f64, plots: &mut Vec<Plot>) {
     plots.clear();
     for (index, level) in levels.iter_mut().enumerate() {
+        let least_images = level.background().least_known(usual_interval);
         let side = level.change.width();
         for y in 1..level.change.height().saturating_sub(1) {
             let changes = level.change.row(y).iter();
@@ -88,9 +88,8 @@ pub(super) fn find(levels: &mut [Level], least_images: f32, plots: &mut Vec<Plot
                 continue;
             }
             for x in 1..side.saturating_sub(1) {
-                let is_large = level.change.row(y)[x].abs() >= LEAST_CHANGE;
-                if is_large && level.background().has_learnt([x, y], least_images) {
-                    plots.extend(plot_at(level, index, [x, y]));
+                if level.change.row(y)[x].abs() >= LEAST_CHANGE {
+                    plots.extend(plot_at(level, index, [x, y], least_images));
                 }
             }
         }
@@ -107,10 +106,13 @@ pub(super) fn find(levels: &mut [Level], least_images: f32, plots: &mut Vec<Plot
     plots.truncate(kept);
 }
 
-/// The plot of a change that is the greatest within a cell, if something stands out there.
-fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
+/// The plot of a change that is the greatest within a cell, if something stands out there and the
+/// background has been learnt from so many images.
+fn plot_at(level: &mut Level, index: usize, at: [usize; 2], least_images: f32) -> Option<Plot> {
     let change = level.change.row(at[1])[at[0]];
-    if greatest_about(&level.change, at, f32::abs) != at {
+    // Its top may be of a place that a known target has covered until now, which is learnt late.
+    let is_known = level.background().has_learnt(at, least_images);
+    if !is_known || greatest_about(&level.change, at, f32::abs) != at {
         return None;
     }
     let sign = change.signum();

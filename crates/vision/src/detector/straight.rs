@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use crossfix_correlation::{Plane, Resampler, View};
 
-use super::filter::SURROUNDINGS;
+use super::background::MARGIN;
 use crate::scene_turn::SceneTurn;
 use crate::{ImagePoint, PixelBox};
 
@@ -107,9 +107,12 @@ impl Straightening {
         let (first, second) = (place(0), place(1));
         let (mut from, mut to) = (0.0_f64, count as f64 - 1.0);
         let axes = [(first.x, second.x, self.sides[0]), (first.y, second.y, self.sides[1])];
-        // first + step column lies from one cell to a cell from the other side.
+        // What a cell is compared with reaches as far in the image, turned: |1 + zoom| + |roll|.
+        let [zoom, roll] = self.unbent.zoom_and_roll();
+        let margin = (MARGIN * cell) as f64 * ((1.0 + zoom).abs() + roll.abs());
+        // first + step column lies from the margin to as far from the other side.
         for (first, second, side) in axes {
-            let (step, margin) = (second - first, ((SURROUNDINGS + 1) * cell) as f64);
+            let step = second - first;
             let bounds = [margin - first, side as f64 - 1.0 - margin - first];
             if step.abs() < 1e-9 {
                 if bounds[0] > 0.0 || bounds[1] < 0.0 {

@@ -8,9 +8,9 @@ use crate::scene_turn::SceneTurn;
 /// of 20 px makes all that is in view move at 200 px/s instead of 100.
 const TURN_S: f64 = 0.2;
 /// Most roll (rad) and zoom (a share) of an image against that to which the background is fixed:
-/// corners are out of its view by then, and an image that is larger is blurred. With a tenth the
-/// background is fixed anew more often, and what is about to be found is forgotten each time: before
-/// thermal cameras that zoom 55 % of the images have their target, not 64.
+/// corners are out of its view by then, and an image that is larger is blurred. With 0.1 the
+/// background is fixed anew more often, and what is about to be found is forgotten each time:
+/// before thermal cameras that zoom 55 % of the images have their target, not 64.
 const MOST_BENT: f64 = 0.25;
 
 /// Time and camera direction of an image, for the background.
@@ -22,18 +22,18 @@ pub(super) struct Moment {
     pub(super) turning_px_s: f64,
     /// Time since the image before, s.
     pub(super) interval: f64,
-    /// Least weight of this image in the background.
+    /// Least weight of this image in the background, and that in a plain mean of all its images.
     pub(super) share: f32,
-    /// Number of images from which the background has been learnt before.
-    pub(super) images: u32,
+    pub(super) young: f32,
+    pub(super) is_first: bool,
 }
 
 /// The images' views of the background.
 #[derive(Debug)]
 pub(super) struct Views {
     sides: [usize; 2],
-    /// Where what was in the image to which the background is fixed, and in the last one, was at the
-    /// tracker's first image.
+    /// Where what was in the image to which the background is fixed, and in the last one, was at
+    /// the tracker's first image.
     fixed: SceneTurn,
     last: Option<SceneTurn>,
     /// A running mean of how fast the middle of the image turns, px/s.
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_rolls_or_zooms_far_is_seen_to() {
+    fn a_camera_that_rolls_or_zooms_far_is_noticed() {
         let middle = ImagePoint { x: 159.5, y: 119.5 };
         for (zoom, roll, is_far) in [
             (-0.2, 0.0, false),
@@ -118,6 +118,7 @@ mod tests {
             (0.2, 0.0, false),
             (0.3, 0.0, true),
             (0.0, 0.2, false),
+            (0.0, 0.3, true),
         ] {
             let mut views = Views::new(SIDES);
             views.note_turn(SceneTurn::shift([500.0, 3.0]), 0.1);

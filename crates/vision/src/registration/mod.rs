@@ -50,6 +50,10 @@ const FARTHEST: i32 = 9;
 /// Farthest that a registration may lead from the best whole shift, pixels per axis: half a pixel,
 /// and half of that. With half of it a shift half-way between two pixels stays at one of them.
 const NEAR_WHOLE: f32 = 0.75;
+/// Two fits that differ by less than this per axis are of the same shift, pixels: like parts that
+/// are nearer to each other do not show in such a picture. With half of it the errors of a fit over
+/// waves count as another shift, which then needs to fit better than itself.
+const SAME_SHIFT: f32 = 0.75;
 /// Fewest pixels in common (sum of their weights) from which a turn is found. With half of it they
 /// may all be those of one target.
 pub(crate) const LEAST_COMMON: f32 = 50.0;
@@ -277,7 +281,7 @@ impl<'a> PicturePair<'a> {
         of(fit).better_by(&of(&self.fit_at(than)), bar)
     }
 
-    /// Whether the pictures fit better at one turn than at another, by the bar.
+    /// Whether the pictures fit better at a turn than at another, by so much that it shows.
     pub(crate) fn fits_better(&self, turn: PictureTurn, than: PictureTurn, bar: Bar) -> bool {
         self.better_by(&self.fit_at(turn), than, bar).is_some()
     }
@@ -300,7 +304,7 @@ impl<'a> PicturePair<'a> {
         let guess = PictureTurn::of_shift(guess);
         let nearer = self.fit_near(guess, guess, 0.0);
         let is_other = |nearer: &PictureFit| {
-            nearer.turn.shift.iter().zip(shift).any(|(at, shift)| (at - shift).abs() > NEAR_WHOLE)
+            nearer.turn.shift.iter().zip(shift).any(|(at, shift)| (at - shift).abs() > SAME_SHIFT)
         };
         if let Some(nearer) = nearer.filter(is_other)
             && !after.misfits(0.0).are_better_in_most(&nearer.misfits(0.0))
@@ -411,7 +415,8 @@ mod tests {
         }
     }
 
-    /// A fence: it fits better where it has shifted by one of its posts, as that is by whole pixels.
+    /// A fence: it fits better where it has shifted by one of its posts, as that is by whole
+    /// pixels.
     #[test]
     fn a_scene_of_like_parts_has_not_shifted_by_one_of_them() {
         let fence = |right: f32, seed| {
