@@ -267,7 +267,15 @@ impl Detector {
     /// Takes the image's plots into the candidates.
     fn plot(&mut self, interval: f64, known: &[KnownTarget]) {
         plots::find(&mut self.levels, self.usual_interval, &mut self.plots);
-        self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));
+        // What has its middle beyond the border is cut off by it, and seems to move as it comes in.
+        let sides = self.sides;
+        let is_inside = |plot: &Plot| {
+            let within = |at: f64, side: usize| (0.0..=side as f64 - 1.0).contains(&at);
+            within(plot.place.x, sides[0]) && within(plot.place.y, sides[1])
+        };
+        self.plots.retain(|plot| {
+            is_inside(plot) && !known.iter().any(|known| touches(&known.place, plot))
+        });
         self.candidates.step(&self.plots, interval, self.sides);
     }
 
