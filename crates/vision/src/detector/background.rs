@@ -3,11 +3,11 @@
 
 use crossfix_correlation::Plane;
 
-use super::WARM_UP_IMAGES;
 use super::cell_update::{BackgroundRow, CellUpdate};
 use super::cells::{Cells, CellsInView, free_of};
 use super::filter::{SURROUNDINGS, between, clear_beyond, clear_border, moved, resample};
 use super::straight::Straightening;
+use super::{WARM_UP_IMAGES, WARM_UP_S};
 use crate::ImagePoint;
 use crate::scene_turn::SceneTurn;
 
@@ -15,11 +15,6 @@ use crate::scene_turn::SceneTurn;
 /// cut off. With half of it 1.3 more tracks per minute are begun on what comes into a panning
 /// thermal camera's view.
 pub(super) const MARGIN: usize = SURROUNDINGS;
-
-/// What has come into a turning camera's view is known after this time, s: twice the warm-up, as
-/// the errors of the registration make its mean worse than that of a still one. With half of it one
-/// more track per minute is begun on the scene of such cameras.
-const COMES_S: f64 = 0.5;
 
 /// What stands out of one scale of the scene, and how that varies.
 ///
@@ -114,10 +109,10 @@ impl Background {
         self.learnt_images.row(y)[x] >= least_images
     }
 
-    /// From how many images a cell must have been learnt to be known: those of [`COMES_S`], but a
-    /// few, or as many as there were.
+    /// From how many images a cell must have been learnt to be known: as many as warm up the whole,
+    /// or as many as there were.
     pub(super) fn least_known(&self, usual_interval: f64) -> f32 {
-        let images = (COMES_S / usual_interval).max(f64::from(WARM_UP_IMAGES)) as f32;
+        let images = (WARM_UP_S / usual_interval).max(f64::from(WARM_UP_IMAGES)) as f32;
         images.min(self.images)
     }
 
@@ -236,8 +231,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cell_is_known_after_half_a_second_and_a_few_images_or_as_many_as_there_were() {
-        for (images, interval, known) in [(100, 0.1, 5.0), (100, 1.0, 4.0), (3, 0.1, 3.0)] {
+    fn a_cell_is_known_after_the_warm_up_or_as_many_images_as_there_were() {
+        for (images, interval, known) in [(100, 0.05, 5.0), (100, 1.0, 4.0), (3, 0.05, 3.0)] {
             let mut background = Background::new(2);
             background.begin([20, 20]);
             background.turn_to(Straightening::new(SceneTurn::none(), [40, 40]));

@@ -433,9 +433,10 @@ mod tests {
             let turned = SceneTurn::about(ImagePoint { x, y }, [3.0, -2.0], zoom, 0.1);
             level.fix_to(Straightening::new(turned, SIDES), INTERVAL_S);
             see_waves(&mut level, [turned, SceneTurn::none()], 40, 0.0);
+            let least = level.background().least_known(INTERVAL_S);
             let (mut squares, mut known) = ([0.0; 2], 0);
             for y in 0..60 {
-                for x in (0..80).filter(|x| level.background().has_learnt([*x, y], 15.0)) {
+                for x in (0..80).filter(|x| level.background().has_learnt([*x, y], least)) {
                     let now = level.now.row(y)[x];
                     let off = now * level.new_share([x, y]);
                     squares = [squares[0] + now * now, squares[1] + off * off];

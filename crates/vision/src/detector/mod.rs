@@ -50,7 +50,8 @@ const CELLS: [usize; 4] = [2, 4, 8, 16];
 /// Fewest cells per side of a scale: a cell's surroundings, and as much again. With half of it
 /// hardly a cell has whole surroundings.
 const LEAST_CELLS: usize = 18;
-/// How long the background is learnt before anything is found, s. With half of it the background is
+/// How long the background, and each part of it that comes into view, is learnt before anything is
+/// found there, s. With half of it the background is
 /// a mean of 4 images at first, at 30 per second, whose noise adds a quarter to the variance of the
 /// changes.
 const WARM_UP_S: f64 = 0.25;
@@ -59,8 +60,8 @@ const WARM_UP_S: f64 = 0.25;
 /// streams.
 const WARM_UP_IMAGES: u32 = 4;
 /// Weight of an interval in the running mean of them: one image that is left out, or comes late,
-/// hardly changes it. A second after a stream has fallen from 30 to 10 images per second, half a
-/// second is counted as 7 images (5 would be right); with half of this weight as 8.
+/// hardly changes it. A second after a stream has fallen from 30 to 10 images per second, a second
+/// is counted as 13 images (10 would be right); with half of this weight as 17.
 const INTERVALS: f64 = 0.1;
 /// A background that is still being learnt may look like another scene's for this long before it is
 /// begun anew, s: in a clear sky the first image's targets are all of its texture, and as they move

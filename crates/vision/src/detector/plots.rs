@@ -110,7 +110,7 @@ pub(super) fn find(levels: &mut [Level], usual_interval: f64, plots: &mut Vec<Pl
 /// background has been learnt from so many images.
 fn plot_at(level: &mut Level, index: usize, at: [usize; 2], least_images: f32) -> Option<Plot> {
     let change = level.change.row(at[1])[at[0]];
-    // Its top may be of a place that a known target has covered until now, which is learnt late.
+    // Its top need not be known: a followed target may have covered that until now.
     let is_known = level.background().has_learnt(at, least_images);
     if !is_known || greatest_about(&level.change, at, f32::abs) != at {
         return None;
