@@ -46,8 +46,6 @@ pub(crate) struct ChartPoint {
     pub(crate) velocity: Vector3<f64>,
     /// Derivative of the position by the first three coordinates.
     pub(crate) place_by: Matrix3<f64>,
-    /// Derivative of position and velocity by the coordinates.
-    pub(crate) state_by: Matrix6<f64>,
 }
 
 /// An update of position and velocity.
@@ -113,7 +111,7 @@ impl StateChart {
         match self {
             Self::Cartesian(_) => StateUpdate { covariance, carried: left, gain },
             Self::ByRange(chart) => {
-                let state_by = point.state_by;
+                let state_by = chart.state_by(point);
                 let covariance = state_by * covariance * state_by.transpose();
                 // From state to chart at the old point, from chart to state at the new one.
                 let carried = state_by * left * chart.by_state();
@@ -129,7 +127,6 @@ impl StateChart {
                 place: state.position() + coordinates.fixed_rows::<3>(0),
                 velocity: state.velocity() + coordinates.fixed_rows::<3>(3),
                 place_by: Matrix3::identity(),
-                state_by: Matrix6::identity(),
             },
             Self::ByRange(chart) => chart.point(coordinates),
         }
@@ -180,18 +177,19 @@ impl RangeChart {
         place_by.set_column(2, &(direction.into_inner() * range));
         // v = (v0/r0 + w) r: velocity in ranges per second scales with the unknown range.
         let velocity = (self.share + coordinates.fixed_rows::<3>(3)) * range;
-        // dp/d(a, c) as above, dv/dc = v, dv/dw = r I.
-        let mut state_by = Matrix6::zeros();
-        state_by.fixed_view_mut::<3, 3>(0, 0).copy_from(&place_by);
-        state_by.fixed_view_mut::<3, 1>(3, 2).copy_from(&velocity);
-        state_by.fixed_view_mut::<3, 3>(3, 3).fill_with_identity();
-        state_by.fixed_view_mut::<3, 3>(3, 3).scale_mut(range);
-        ChartPoint {
-            place: self.origin + direction.into_inner() * range,
-            velocity,
-            place_by,
-            state_by,
-        }
+        ChartPoint { place: self.origin + direction.into_inner() * range, velocity, place_by }
+    }
+
+    /// Derivative of position and velocity by the coordinates, at a point.
+    fn state_by(&self, point: &ChartPoint) -> Matrix6<f64> {
+        // dp/d(a, c) as in `place_by`, dv/dc = v, dv/dw = r I.
+        let range = (point.place - self.origin).norm();
+        let mut by = Matrix6::zeros();
+        by.fixed_view_mut::<3, 3>(0, 0).copy_from(&point.place_by);
+        by.fixed_view_mut::<3, 1>(3, 2).copy_from(&point.velocity);
+        by.fixed_view_mut::<3, 3>(3, 3).fill_with_identity();
+        by.fixed_view_mut::<3, 3>(3, 3).scale_mut(range);
+        by
     }
 
     /// The coordinate ln(r / r0) at which the sight line passes nearest to `line`.
@@ -228,11 +226,11 @@ mod tests {
         let chart = RangeChart::new(Point3::new(1.0, 2.0, 3.0), &state()).unwrap();
         let here = chart.point(&Vector6::zeros());
         assert!((here.mean() - state().mean).norm() < 1e-9);
-        assert!((chart.by_state() * here.state_by - Matrix6::identity()).norm() < 1e-12);
+        assert!((chart.by_state() * chart.state_by(&here) - Matrix6::identity()).norm() < 1e-12);
         for axis in 0..6 {
             let step = Vector6::ith(axis, 1e-6);
             let slope = (chart.point(&step).mean() - chart.point(&-step).mean()) / 2e-6;
-            assert!((slope - here.state_by.column(axis)).norm() < 1e-5, "axis {axis}");
+            assert!((slope - chart.state_by(&here).column(axis)).norm() < 1e-5, "axis {axis}");
         }
     }
 

@@ -193,7 +193,7 @@ impl Linearised {
         // If the prior range was uncertain by kilometres, rounding may leave a covariance that is
         // not positive definite.
         let positive = state.covariance.cholesky().is_some();
-        (positive && state.is_finite() && nis.is_finite()).then(|| Updated {
+        (positive && nis.is_finite()).then(|| Updated {
             state,
             nis,
             // ln N(z; 0, S) in two dimensions: -(z' S^-1 z + ln((2 pi)^2 |S|)) / 2.

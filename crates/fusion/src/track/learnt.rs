@@ -16,7 +16,9 @@ use nalgebra::{DMatrix, Dyn, Matrix2, Matrix6, OMatrix, U2, U6, Vector2};
 
 use super::ties::{LearntTies, Rescaling};
 use super::{FusedTrack, Ties};
-use crate::uncertainty::{CONSIDERED, CorrelatedNoise, LASTING, SharedCovariance, SharedErrors};
+use crate::uncertainty::{
+    CONSIDERED, CorrelatedNoise, LASTING, SharedCovariance, SharedErrors, SharedTies,
+};
 use crate::update::CrossUpdate;
 
 /// Most cameras whose lasting errors a track learns, as an update's cost grows with the square of
@@ -104,13 +106,13 @@ impl FusedTrack {
             *mean *= *kept;
         }
         for (name, ties) in &mut self.ties {
-            ties.covariance = ties.predicted(interval);
+            let own_kept = ties.kept(interval);
+            ties.predict(interval, own_kept);
             if kept.is_empty() {
                 continue;
             }
             // Each lasting error decays with its own factor k: columns by this camera's, rows by
             // the row's camera, and (1 - k^2) I of new error in the camera's own block.
-            let own_kept = ties.kept(interval);
             let mut lasting = ties.learnt.fixed_columns_mut::<2>(LASTING);
             lasting *= own_kept;
             for (place, kept) in kept.iter().enumerate() {
@@ -353,26 +355,32 @@ impl FusedTrack {
     /// The part of the state's covariance that the shared errors cause, which is its lower bound.
     /// If rounding has made the learnt errors' covariance indefinite, they are reset.
     pub(super) fn shared_part(&mut self) -> Matrix6<f64> {
-        let of_cameras = self.ties.iter().map(|(name, ties)| self.considered_part(name, ties));
-        // P >= sum of X_k X_k' for independent errors of unit variance.
-        let considered = sum_by_size(of_cameras.collect());
-        match self.learnt_part() {
-            Some(learnt) => considered + learnt,
-            None => {
-                self.forget_all();
-                let all = self.ties.values().map(|t| t.covariance * t.covariance.transpose());
-                sum_by_size(all.collect())
-            }
+        if let Some(learnt) = self.learnt_part() {
+            return self.considered_part() + learnt;
         }
+        self.forget_all();
+        self.considered_part()
     }
 
-    /// The part that a camera's errors cause that are considered and not learnt.
-    fn considered_part(&self, camera: &CameraName, ties: &Ties) -> Matrix6<f64> {
-        let mut considered = ties.covariance;
-        if self.learnt.row_of(camera).is_some() {
-            considered.fixed_columns_mut::<2>(LASTING).fill(0.0);
+    /// The part that the errors cause that are considered and not learnt: the sum of X X' over the
+    /// cameras, as these errors are independent and have unit variance.
+    ///
+    /// It is summed by size and not by the cameras' names, so that names decide no rounding: a
+    /// nearly singular matrix magnifies it.
+    fn considered_part(&self) -> Matrix6<f64> {
+        let mut parts: Vec<(f64, &CameraName, &SharedTies)> = (self.ties.iter())
+            .map(|(name, Ties { covariance, .. })| (covariance.norm_squared(), name, covariance))
+            .collect();
+        parts.sort_by(|one, other| one.0.total_cmp(&other.0));
+        let mut sum = Matrix6::zeros();
+        for (_, name, ties) in parts {
+            let mut considered = *ties;
+            if self.learns(name) {
+                considered.fixed_columns_mut::<2>(LASTING).fill(0.0);
+            }
+            sum += considered * considered.transpose();
         }
-        considered * considered.transpose()
+        sum
     }
 
     /// The part that the learnt errors cause beyond the considered ones; `None` if their covariance
@@ -408,11 +416,4 @@ impl FusedTrack {
 /// long.
 fn has_forgotten(ties: &Ties, now: Timestamp) -> bool {
     ties.silent_s(now).is_none_or(|silent_s| silent_s > FORGOTTEN * ties.lasting_s)
-}
-
-/// The sum by size and not by the cameras' names, so that names decide no rounding: a nearly
-/// singular matrix magnifies it.
-fn sum_by_size(mut parts: Vec<Matrix6<f64>>) -> Matrix6<f64> {
-    parts.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
-    parts.iter().sum()
 }

@@ -247,18 +247,31 @@ impl Ties {
     /// errors have partly decayed.
     pub(super) fn predicted(&self, interval: f64) -> SharedTies {
         let mut covariance = self.covariance;
-        let velocity = covariance.fixed_rows::<3>(3).into_owned();
-        // X <- F X exp(-t / T), the last factor in the columns of the lasting errors only.
-        let mut position = covariance.fixed_rows_mut::<3>(0);
-        position += velocity * interval;
-        let mut lasting = covariance.fixed_columns_mut::<2>(LASTING);
-        lasting *= self.kept(interval);
+        predict(&mut covariance, interval, self.kept(interval));
         covariance
+    }
+
+    /// Moves the ties on by an interval over which this share of the lasting errors is left.
+    pub(super) fn predict(&mut self, interval: f64, kept: f64) {
+        predict(&mut self.covariance, interval, kept);
     }
 
     /// Share of a lasting error that is left after an interval (s): exp(-t / T).
     pub(super) fn kept(&self, interval: f64) -> f64 {
         (-interval.abs() / self.lasting_s).exp()
+    }
+}
+
+/// X <- F X k: the position moves on with the velocity, and of the errors that last a share k is
+/// left.
+fn predict(ties: &mut SharedTies, interval: f64, kept: f64) {
+    for (error, mut tie) in ties.column_iter_mut().enumerate() {
+        for axis in 0..3 {
+            tie[axis] += tie[axis + 3] * interval;
+        }
+        if error >= LASTING {
+            tie *= kept;
+        }
     }
 }
 
