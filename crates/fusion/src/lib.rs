@@ -58,6 +58,7 @@ mod config;
 mod counters;
 mod cueing;
 mod event_time;
+mod evidence;
 mod fusion;
 mod ingress;
 mod initiation;

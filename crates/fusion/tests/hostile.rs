@@ -235,6 +235,22 @@ fn after_all_clocks_were_ahead_the_order_is_taken_up_anew_and_targets_are_found(
 }
 
 #[test]
+fn two_cameras_whose_clocks_were_ahead_at_first_find_targets() {
+    let mut scene = two_targets(0.0..12.0);
+    scene.eyes.truncate(2);
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    for mut frame in scene.frames(3) {
+        if frame.capture_time_ns < 1_000_000_000 {
+            frame.capture_time_ns += 600_000_000_000;
+        }
+        frame.sequence = 0;
+        fusion.ingest(&frame);
+    }
+    assert_eq!(fusion.counters().get("event_time_restarts"), 1);
+    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
+}
+
+#[test]
 fn clocks_that_are_all_ten_minutes_ahead_and_numbered_frames_lose_no_frame_and_targets_are_found() {
     let (scene, mut fusion) = all_clocks_ahead(600_000_000_000, true);
     assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));

@@ -54,10 +54,11 @@ pub use watch::PoseFinding;
 /// says so, as the noise is counted anyway: with half of it every camera that is found to be
 /// noisier than reported, by however little, would be doubted.
 const DOUBTED_NOISE: f64 = 2.0;
-/// A clock whose variance (logarithm) and offset (in its deviations) change by less than this
-/// changes no track. With half of it tracks are told up to twice as often, and as often the watch
-/// for moved cameras forgets what it knows of the clock.
-const NOTICED_CLOCK: f64 = 0.1;
+/// What is known of a camera (the logarithm of a variance, or an offset in its deviations) and
+/// changes by less than this changes no track: it is 5 % of a deviation. With half of it tracks are
+/// told up to twice as often, and gain nothing, and as often the watch for moved cameras forgets
+/// what it knows of a clock.
+const NOTICED: f64 = 0.1;
 /// Variance ratio that another clock has to the one before: so large that what a track has learnt
 /// of the one says nothing of the other. With half of it the same.
 const ANOTHER_CLOCK: f64 = 1e24;
@@ -203,7 +204,7 @@ impl CameraState {
         let ratio = (now.sd_s / told.sd_s).powi(2);
         let ahead = (now.offset_s - told.offset_s) / told.sd_s;
         let known = told.sd_s > RIGHT_CLOCK_S && now.sd_s > RIGHT_CLOCK_S;
-        if known && ratio.ln().abs() < NOTICED_CLOCK && ahead.abs() < NOTICED_CLOCK {
+        if known && ratio.ln().abs() < NOTICED && ahead.abs() < NOTICED {
             return None;
         }
         self.told_clock = Some(now);
@@ -378,13 +379,11 @@ impl Cameras {
         Assessment { standing, suspects_clock: misfits || excluded }
     }
 
-    /// Forgets the cameras' clutter rates: they are of another time.
-    pub(crate) fn forget_clutter(&mut self) {
-        self.by_name.values_mut().for_each(|camera| camera.clutter = ClutterRate::default());
-    }
-
-    /// Forgets what the cameras have seen stand in their views, and since when.
-    pub(crate) fn reset_views(&mut self) {
-        self.by_name.values_mut().for_each(|camera| camera.view = camera.view.emptied());
+    /// Forgets the cameras' clutter rates, and what they have seen stand in their views and since
+    /// when: it is of another time.
+    pub(crate) fn forget_views(&mut self) {
+        for camera in self.by_name.values_mut() {
+            (camera.clutter, camera.view) = (ClutterRate::default(), camera.view.emptied());
+        }
     }
 }

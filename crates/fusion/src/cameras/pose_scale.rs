@@ -11,7 +11,7 @@
 use crossfix_message::CameraName;
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Vector2, Vector3};
 
-use super::Cameras;
+use super::{Cameras, NOTICED};
 
 /// Share of a draw in the running means, once there are enough. A draw lasts a third of a second:
 /// the means remember some three seconds of one target. With half of it a site would take a minute
@@ -45,9 +45,6 @@ const MAX_DECLARED_SCALE: f64 = 4.0;
 /// (variance) those of a careful survey, is doubted. With half of it one that errs by more than 2.1
 /// deviations is, and not only by more than 3.
 const DOUBTED: f64 = 9.0;
-/// Changes of an estimate (logarithm) by less than this change no track. With half of it tracks are
-/// told up to twice as often, and gain nothing: it is 5 % of a deviation.
-const NOTICED: f64 = 0.1;
 
 /// What a camera has seen of a target during one draw.
 #[derive(Clone, Debug)]

@@ -15,6 +15,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Matrix3, Matrix6, SMatrix, SVector, Vector3};
 
 use super::{Cameras, ScaleSample};
+use crate::evidence::ONE_IN_A_HUNDRED;
 use memory::{ErrorEstimate, Memory};
 
 /// Time constants of the memories, s in which targets are seen: a camera was moved that long ago,
@@ -46,9 +47,6 @@ const FREEDOM: f64 = 4.0;
 /// stands where it stood. With clocks declared exact that were off by up to a tenth of a second, 39
 /// did. With half of it 30 times would do, against odds of a thousand.
 const SURE: f64 = 6.9;
-/// Another camera may have been moved in its place unless that is less likely by more than this
-/// (logarithm): one in a hundred. With half of it one that is ten times less likely is cleared.
-const DISTINCT: f64 = 4.6;
 
 /// Fewer cameras do not check one another: with two, an error in the plane of their sight lines
 /// shows in neither.
@@ -310,7 +308,8 @@ impl ErrorWatch {
         let mut found: BTreeMap<CameraName, PoseFinding> = found.collect();
         let most = found.values().map(|own| own.log_odds).fold(f64::NEG_INFINITY, f64::max);
         // Every camera that explains the lines nearly as well as the likeliest one stays a suspect.
-        let likely = |own: &PoseFinding| own.log_odds > SURE && own.log_odds > most - DISTINCT;
+        let likely =
+            |own: &PoseFinding| own.log_odds > SURE && own.log_odds > most + ONE_IN_A_HUNDRED;
         let suspects: Vec<CameraName> =
             found.iter().filter(|(_, own)| likely(own)).map(|(name, _)| name.clone()).collect();
         for (name, own) in &mut found {

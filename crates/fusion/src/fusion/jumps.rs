@@ -5,15 +5,12 @@ use crossfix_message::{BearingFrame, Timestamp};
 use super::{Fusion, Output};
 use crate::Counters;
 use crate::clocks::ClockEstimator;
+use crate::evidence::BEYOND_DOUBT;
 use crate::ingress::{self, RejectionReason};
 use crate::initiation::Initiator;
 use crate::site_time::{Apart, moved};
 use crate::unmet::Unmet;
 
-/// All clocks are taken to have stepped forward, rather than the cameras to have stood still, if
-/// the targets' bearings make that likelier by this log-likelihood ratio: a host that slept is the
-/// commoner cause. With half of it a likelihood ratio of 55 would do, and not of 3000.
-const STEP_MARGIN: f64 = 8.0;
 /// A longer step forward cannot be told from a host that slept, s: after that nobody knows where a
 /// target is. With half of it a step of a second and a half moves all tracks on by so much, away
 /// from their targets.
@@ -40,10 +37,8 @@ impl Fusion {
         }
         self.smooth_all(outputs);
         let changes = self.tracker.rewind(time);
-        self.cameras.forget_clutter();
         self.emit_events(changes, time, outputs);
-        self.initiator = Initiator::new(&self.config);
-        self.unmet = Unmet::new(&self.config.initiation);
+        self.begin_anew();
         self.clocks = ClockEstimator::new(self.config.clocks.clone());
     }
 
@@ -82,11 +77,11 @@ impl Fusion {
     /// Whether all clocks have stepped by `step_s` seconds. A step back is always one. At a step
     /// forward all cameras may instead have stood still, like those of a host that slept; they have
     /// not if the bearings fit the tracks at the times without the step, and not at the times with
-    /// it.
+    /// it, beyond doubt: a host that slept is the commoner cause.
     fn has_stepped(&self, frames: &[BearingFrame], step_s: f64) -> bool {
         step_s < 0.0
             || (step_s < LONGEST_FORWARD_S
-                && self.fit_of(frames, step_s) > self.fit_of(frames, 0.0) + STEP_MARGIN)
+                && self.fit_of(frames, step_s) > self.fit_of(frames, 0.0) + BEYOND_DOUBT)
     }
 
     /// How well frames fit the tracks with `ahead_s` taken off their times: the sum of the
@@ -95,7 +90,8 @@ impl Fusion {
         frames.iter().filter_map(|frame| self.fit_of_frame(&moved(frame, -ahead_s))).sum()
     }
 
-    /// How well a frame fits the tracks; `None` if it would be refused.
+    /// How well a frame fits the tracks, with its time and noise as reported: both times are
+    /// compared by the same. `None` if it would be refused.
     fn fit_of_frame(&self, frame: &BearingFrame) -> Option<f64> {
         let name = frame.camera.parse().ok()?;
         let known = self.cameras.at(&name, Timestamp::from_nanos(frame.capture_time_ns))?;
@@ -112,8 +108,12 @@ impl Fusion {
         self.buffer.reset();
         self.tracker.step_time(step_s);
         self.clocks.step_time(step_s);
-        self.cameras.forget_clutter();
-        self.cameras.reset_views();
+        self.begin_anew();
+    }
+
+    /// Forgets what has been gathered of other things than tracks: it is of another time.
+    fn begin_anew(&mut self) {
+        self.cameras.forget_views();
         self.initiator = Initiator::new(&self.config);
         self.unmet = Unmet::new(&self.config.initiation);
     }
