@@ -13,61 +13,50 @@ use crate::{
 struct KeyRange {
     key: &'static str,
     value: f64,
-    least: f64,
-    most: f64,
+    bounds: Bounds,
+    /// Whether the chosen methods use it.
+    is_used: bool,
+}
+
+/// Where a number makes sense.
+#[derive(Clone, Copy)]
+enum Bounds {
+    FromTo(f64, f64),
+    /// Between 0 and 1, which are not possible.
+    Probability,
 }
 
 const fn range(key: &'static str, value: f64, least: f64, most: f64) -> KeyRange {
-    KeyRange { key, value, least, most }
+    KeyRange { key, value, bounds: Bounds::FromTo(least, most), is_used: true }
 }
 
-/// A key and its number.
-type NumberKey = (&'static str, fn(&FusionConfig) -> f64);
-
-/// Keys of equal weights for all bearings.
-const OF_EQUAL_WEIGHTS: &[NumberKey] = &[("bearings.equal_sd_rad", |c| c.bearings.equal_sd_rad)];
-/// Keys of the papers' pairs of lines.
-const OF_PAIRS: &[NumberKey] = &[("initiation.pair_gate_m2", |c| c.initiation.pair_gate_m2)];
-/// Keys of the papers' grouping of fixes.
-const OF_GROUPING: &[NumberKey] =
-    &[("initiation.temporal_gate_m", |c| c.initiation.temporal_gate_m.unwrap_or(f64::NAN))];
-/// Keys of the initiation by hypotheses.
-const OF_HYPOTHESES: &[NumberKey] = &[
-    ("initiation.birth_density_per_m3", |c| c.initiation.birth_density_per_m3),
-    ("initiation.pair_s", |c| c.initiation.pair_s),
-];
-/// Keys of a single motion model.
-const OF_ONE_MODEL: &[NumberKey] =
-    &[("tracking.acceleration_density", |c| c.tracking.acceleration_density)];
-/// Keys of several motion models.
-const OF_MODELS: &[NumberKey] = &[
-    ("tracking.switching_rate_per_s", |c| c.tracking.switching_rate_per_s),
-    ("tracking.calming_rate_per_s", |c| c.tracking.calming_rate_per_s),
-    ("tracking.restlessness_prior_s", |c| c.tracking.restlessness_prior_s),
-];
-/// Keys of the manoeuvre detector by smoothed residuals.
-const OF_SMOOTHED_RESIDUAL: &[NumberKey] = &[
-    ("tracking.residual_window", |c| c.tracking.residual_window as f64),
-    ("tracking.residual_scale", |c| c.tracking.residual_scale),
-];
-/// Keys of the manoeuvre detector by innovations.
-const OF_INNOVATION: &[NumberKey] = &[
-    ("tracking.innovation_window", |c| c.tracking.innovation_window as f64),
-    ("tracking.innovation_false_alarm", |c| c.tracking.innovation_false_alarm),
-];
+const fn probability(key: &'static str, value: f64) -> KeyRange {
+    KeyRange { key, value, bounds: Bounds::Probability, is_used: true }
+}
 
 impl KeyRange {
+    /// The same, of which only some methods make use, which are chosen or not.
+    const fn used_if(self, is_used: bool) -> Self {
+        Self { is_used, ..self }
+    }
+
     fn check(&self) -> Result<(), FusionConfigError> {
-        let &Self { key, value, least, most } = self;
+        let &Self { key, value, bounds, .. } = self;
         // NaN is in no range.
-        if (least..=most).contains(&value) {
-            return Ok(());
-        }
-        Err(FusionConfigError {
-            key,
-            value,
-            must: format!("from {} to {}", plain(least), plain(most)),
-        })
+        let (is_possible, must) = match bounds {
+            Bounds::FromTo(least, most) => (
+                (least..=most).contains(&value),
+                format!("from {} to {}", plain(least), plain(most)),
+            ),
+            Bounds::Probability => {
+                (value > 0.0 && value < 1.0, "a probability between 0 and 1".to_owned())
+            }
+        };
+        is_possible.then_some(()).ok_or(FusionConfigError { key, value, must })
+    }
+
+    fn is_same(&self, other: &Self) -> bool {
+        self.key == other.key && self.value.to_bits() == other.value.to_bits()
     }
 }
 
@@ -86,40 +75,24 @@ impl FusionConfig {
     /// # Errors
     /// The first [`FusionConfigError`].
     pub fn validate(&self) -> Result<(), FusionConfigError> {
-        let ranges = [self.time_and_bearings(), self.initiation_ranges(), self.tracking_ranges()];
-        ranges.iter().flatten().try_for_each(KeyRange::check)?;
+        self.numbers().iter().try_for_each(KeyRange::check)?;
         self.models()?;
-        self.probabilities()?;
         self.unused().map_or(Ok(()), Err)
     }
 
     /// Finds a number that differs from the default although none of the chosen methods uses it:
     /// whoever has set it thinks that it does something.
     fn unused(&self) -> Option<FusionConfigError> {
-        let Self { bearings, initiation, tracking, .. } = self;
-        let usual = Self::default();
-        let grouping = initiation.method == InitiationMethod::Grouping;
-        let pairs = grouping && initiation.solver == SpatialSolver::Pair;
-        // The gate between fixes is from the covariances unless it is given.
-        let one_model = tracking.manoeuvres != Manoeuvres::Models
-            || (grouping && initiation.temporal_gate_m.is_none());
-        let keys = [
-            (bearings.weighting == Weighting::Equal, OF_EQUAL_WEIGHTS),
-            (pairs, OF_PAIRS),
-            (grouping, OF_GROUPING),
-            (!grouping, OF_HYPOTHESES),
-            (one_model, OF_ONE_MODEL),
-            (tracking.manoeuvres == Manoeuvres::Models, OF_MODELS),
-            (tracking.manoeuvres == Manoeuvres::SmoothedResidual, OF_SMOOTHED_RESIDUAL),
-            (tracking.manoeuvres == Manoeuvres::Innovation, OF_INNOVATION),
-        ];
-        let unused = keys.into_iter().filter(|(is_used, _)| !is_used).flat_map(|(_, keys)| keys);
-        let mut set =
-            unused.filter(|(_, number)| number(self).to_bits() != number(&usual).to_bits());
-        set.next().map(|(key, number)| {
-            let must = "left out: the method that is chosen does not use it".to_owned();
-            FusionConfigError { key, value: number(self), must }
-        })
+        let usual = Self::default().numbers();
+        let mut unused = self.numbers().into_iter().filter(|number| !number.is_used);
+        let set = unused.find(|number| !usual.iter().any(|usual| usual.is_same(number)))?;
+        let must = "left out: the method that is chosen does not use it".to_owned();
+        Some(FusionConfigError { key: set.key, value: set.value, must })
+    }
+
+    fn numbers(&self) -> Vec<KeyRange> {
+        let all = [self.time_and_bearings(), self.initiation_numbers(), self.tracking_numbers()];
+        all.into_iter().flatten().collect()
     }
 
     fn time_and_bearings(&self) -> Vec<KeyRange> {
@@ -127,45 +100,72 @@ impl FusionConfig {
         vec![
             range("event_time.lateness_s", event_time.lateness_s, 1e-3, 60.0),
             range("event_time.max_ahead_s", event_time.max_ahead_s, 1e-3, 3600.0),
-            range("bearings.equal_sd_rad", bearings.equal_sd_rad, 1e-9, 0.1),
+            range("bearings.equal_sd_rad", bearings.equal_sd_rad, 1e-9, 0.1)
+                .used_if(bearings.weighting == Weighting::Equal),
             range("bearings.systematic_sd_rad", bearings.systematic_sd_rad, 0.0, 0.1),
             range("clocks.least_sd_s", clocks.least_sd_s, 1e-9, 10.0),
             range("clocks.drift_sd", clocks.drift_sd, 1e-12, 0.1),
         ]
     }
 
-    fn initiation_ranges(&self) -> Vec<KeyRange> {
-        let it = &self.initiation;
-        vec![
-            range("initiation.birth_density_per_m3", it.birth_density_per_m3, 1e-30, 1.0),
+    fn groups(&self) -> bool {
+        self.initiation.method == InitiationMethod::Grouping
+    }
+
+    fn initiation_numbers(&self) -> Vec<KeyRange> {
+        let (it, groups) = (&self.initiation, self.groups());
+        let pairs = groups && it.solver == SpatialSolver::Pair;
+        let mut numbers = vec![
+            range("initiation.birth_density_per_m3", it.birth_density_per_m3, 1e-30, 1.0)
+                .used_if(!groups),
             range("initiation.period_s", it.period_s, 1e-4, 60.0),
-            range("initiation.pair_s", it.pair_s, 1e-3, 3600.0),
+            range("initiation.pair_s", it.pair_s, 1e-3, 3600.0).used_if(!groups),
             range("initiation.velocity_prior_sd_mps", it.velocity_prior_sd_mps, 1e-3, 1e4),
             range("initiation.max_range_m", it.max_range_m, 1e-2, 1e6),
-            range("initiation.pair_gate_m2", it.pair_gate_m2, 1e-9, 1e9),
-            range("initiation.temporal_gate_m", it.temporal_gate_m.unwrap_or(1.0), 1e-6, 1e6),
+            range("initiation.pair_gate_m2", it.pair_gate_m2, 1e-9, 1e9).used_if(pairs),
             range("initiation.periods", it.periods as f64, 2.0, 20.0),
             range("initiation.fixes", it.fixes as f64, 1.0, it.periods as f64),
             range("initiation.shared_lines", it.shared_lines as f64, 0.0, 64.0),
-        ]
+            probability("initiation.spatial_gate_probability", it.spatial_gate_probability),
+        ];
+        // The gate between fixes is from the covariances unless it is given.
+        numbers.extend(
+            it.temporal_gate_m
+                .map(|gate| range("initiation.temporal_gate_m", gate, 1e-6, 1e6).used_if(groups)),
+        );
+        numbers
     }
 
-    fn tracking_ranges(&self) -> Vec<KeyRange> {
+    fn tracking_numbers(&self) -> Vec<KeyRange> {
         let it = &self.tracking;
+        let by = |manoeuvres| it.manoeuvres == manoeuvres;
+        let models = by(Manoeuvres::Models);
+        let one_model = !models || (self.groups() && self.initiation.temporal_gate_m.is_none());
+        let (residual, innovation) = (by(Manoeuvres::SmoothedResidual), by(Manoeuvres::Innovation));
         vec![
-            range("tracking.switching_rate_per_s", it.switching_rate_per_s, 1e-9, 100.0),
-            range("tracking.calming_rate_per_s", it.calming_rate_per_s, 1e-9, 100.0),
-            range("tracking.restlessness_prior_s", it.restlessness_prior_s, 1e-3, 1e6),
-            range("tracking.acceleration_density", it.acceleration_density, 1e-12, 1e6),
-            range("tracking.residual_window", it.residual_window as f64, 1.0, 1000.0),
-            range("tracking.residual_scale", it.residual_scale, 1e-3, 1e3),
-            range("tracking.innovation_window", it.innovation_window as f64, 1.0, 1000.0),
+            range("tracking.switching_rate_per_s", it.switching_rate_per_s, 1e-9, 100.0)
+                .used_if(models),
+            range("tracking.calming_rate_per_s", it.calming_rate_per_s, 1e-9, 100.0)
+                .used_if(models),
+            range("tracking.restlessness_prior_s", it.restlessness_prior_s, 1e-3, 1e6)
+                .used_if(models),
+            range("tracking.acceleration_density", it.acceleration_density, 1e-12, 1e6)
+                .used_if(one_model),
+            range("tracking.residual_window", it.residual_window as f64, 1.0, 1000.0)
+                .used_if(residual),
+            range("tracking.residual_scale", it.residual_scale, 1e-3, 1e3).used_if(residual),
+            range("tracking.innovation_window", it.innovation_window as f64, 1.0, 1000.0)
+                .used_if(innovation),
+            probability("tracking.innovation_false_alarm", it.innovation_false_alarm)
+                .used_if(innovation),
             range("tracking.clutter_per_sr", it.clutter_per_sr, 1e-9, 1e6),
             range("tracking.confirm_score", it.confirm_score, 1e-3, MAX_SCORE),
             range("tracking.coasting_after_s", it.coasting_after_s, 1e-3, 3600.0),
             range("tracking.lost_after_s", it.lost_after_s, 1e-3, 3600.0),
             range("tracking.max_position_sd_m", it.max_position_sd_m, 1e-3, 1e5),
             range("tracking.smoothing_s", it.smoothing_s, 0.0, 2.0),
+            probability("tracking.gate_probability", it.gate_probability),
+            probability("tracking.detection_probability", it.detection_probability),
         ]
     }
 
@@ -174,26 +174,6 @@ impl FusionConfig {
         let density = |model: &FlightModel| range(key, model.acceleration_density, 0.0, 1e6);
         self.tracking.models.iter().map(density).try_for_each(|range| range.check())?;
         MotionSetup::new(&self.tracking).map(drop)
-    }
-
-    fn probabilities(&self) -> Result<(), FusionConfigError> {
-        let Self { initiation, tracking, .. } = self;
-        let probabilities = [
-            ("initiation.spatial_gate_probability", initiation.spatial_gate_probability),
-            ("tracking.gate_probability", tracking.gate_probability),
-            ("tracking.detection_probability", tracking.detection_probability),
-            ("tracking.innovation_false_alarm", tracking.innovation_false_alarm),
-        ];
-        for (key, value) in probabilities {
-            if !(value > 0.0 && value < 1.0) {
-                return Err(FusionConfigError {
-                    key,
-                    value,
-                    must: "a probability between 0 and 1".to_owned(),
-                });
-            }
-        }
-        Ok(())
     }
 }
 
@@ -247,13 +227,10 @@ mod tests {
 
     #[test]
     fn nothing_that_is_not_a_number_is_taken_anywhere() {
-        let config = FusionConfig::default();
-        let tables =
-            [config.time_and_bearings(), config.initiation_ranges(), config.tracking_ranges()];
-        for range in tables.iter().flatten() {
+        for range in FusionConfig::default().numbers() {
             assert_eq!(range.check(), Ok(()), "the default is in its range");
             for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -1.0, 1e150] {
-                let odd = KeyRange { value, ..*range };
+                let odd = KeyRange { value, ..range };
                 assert!(odd.check().is_err(), "{} may be {value}", odd.key);
             }
         }

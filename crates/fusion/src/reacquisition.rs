@@ -8,15 +8,12 @@ use std::collections::BTreeMap;
 use crossfix_filter::Gate;
 
 use crate::cameras::KnownCamera;
+use crate::evidence::BEYOND_DOUBT;
 use crate::motion::MotionSetup;
 use crate::track::{FusedTrack, TrackId};
 use crate::visibility::log_missed;
 use crate::{Exposure, Tracking};
 
-/// A leaf replaces the track when its bearings are likelier the target's than clutter by this
-/// log-likelihood ratio: a chance of 1 in 3000. Half of it would settle one re-acquisition in 50 on
-/// clutter.
-pub(crate) const FOUND_AGAIN_MARGIN: f64 = 8.0;
 /// A leaf whose log-likelihood ratio falls to this is given up. With half of it one miss ends a
 /// leaf of even odds; as it is, two do.
 const GIVEN_UP: f64 = -3.0;
@@ -148,7 +145,7 @@ impl Reacquisition {
             next.sort_by(|a, b| b.0.log_ratio.total_cmp(&a.0.log_ratio));
             next.truncate(MAX_LEAVES);
             match next.first() {
-                Some((best, index)) if best.log_ratio >= FOUND_AGAIN_MARGIN => {
+                Some((best, index)) if best.log_ratio >= BEYOND_DOUBT => {
                     found.push((best.track.clone(), *index));
                 }
                 Some(_) => {

@@ -123,56 +123,43 @@ impl fmt::Display for WhyNothing {
     }
 }
 
-/// Result of one comparison.
-#[derive(Clone, Copy, Debug)]
-enum PairResult {
-    /// One of the cameras saw nothing.
-    Nothing,
-    /// The cameras stand in the same place.
-    Together,
-    Lines(Passing),
-}
+impl UnmetLines {
+    fn of(passing: Passing, max_range_m: f64) -> Self {
+        match passing {
+            Passing::Nowhere => Self::Nowhere { max_range_m },
+            Passing::Apart { by_m } => Self::Apart { by_m },
+            Passing::Close => Self::Unsteady,
+        }
+    }
 
-/// What two cameras' lines do, without figures.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum PairFinding {
-    Together,
-    Nowhere,
-    Apart,
-    Close,
-}
-
-impl PairFinding {
-    /// Of two that are equally frequent, the later is the reason: what tells more comes later.
-    const ALL: [Self; 4] = [Self::Together, Self::Nowhere, Self::Apart, Self::Close];
-
-    fn counter(self) -> &'static str {
+    fn counter(&self) -> &'static str {
         match self {
-            Self::Nowhere => "unfound_lines_meet_nowhere",
-            Self::Apart => "unfound_lines_miss_each_other",
-            Self::Close => "unfound_lines_meet",
+            Self::Nowhere { .. } => "unfound_lines_meet_nowhere",
+            Self::Apart { .. } => "unfound_lines_miss_each_other",
+            Self::Unsteady => "unfound_lines_meet",
             Self::Together => "unfound_lines_from_one_place",
         }
     }
-}
 
-impl PairResult {
-    /// `None` if one of the cameras saw nothing.
-    fn finding(self) -> Option<PairFinding> {
+    const RANKS: usize = 4;
+
+    /// Of two that are equally frequent, the one that tells more is the reason: it has the greater
+    /// rank.
+    fn rank(&self) -> usize {
         match self {
-            Self::Nothing => None,
-            Self::Together => Some(PairFinding::Together),
-            Self::Lines(Passing::Nowhere) => Some(PairFinding::Nowhere),
-            Self::Lines(Passing::Apart { .. }) => Some(PairFinding::Apart),
-            Self::Lines(Passing::Close) => Some(PairFinding::Close),
+            Self::Together => 0,
+            Self::Nowhere { .. } => 1,
+            Self::Apart { .. } => 2,
+            Self::Unsteady => 3,
         }
     }
 
-    /// By how much the lines miss each other, m, if they do.
-    fn miss_m(&self) -> Option<f64> {
+    /// How far apart the lines pass each other, m.
+    fn miss_m(&self) -> f64 {
         match self {
-            Self::Lines(Passing::Apart { by_m }) => Some(*by_m),
-            _ => None,
+            Self::Apart { by_m } => *by_m,
+            Self::Nowhere { .. } => f64::INFINITY,
+            Self::Unsteady | Self::Together => 0.0,
         }
     }
 }
@@ -197,26 +184,28 @@ struct LatelySeen {
 #[derive(Clone, Debug)]
 struct PairComparisons {
     time: Timestamp,
-    shown: VecDeque<PairResult>,
+    /// `None` where one of the cameras saw nothing.
+    shown: VecDeque<Option<UnmetLines>>,
 }
 
 impl PairComparisons {
     /// Whether both cameras have seen something in most comparisons, and these are enough.
     fn is_steady(&self) -> bool {
-        let both = self.shown.iter().filter(|shown| shown.finding().is_some()).count();
+        let both = self.shown.iter().flatten().count();
         // Half of the memory is enough to say something.
         self.shown.len() * 2 >= REMEMBERED && both as f64 >= LEAST_SHARE * self.shown.len() as f64
     }
 
-    fn count(&self, wanted: PairFinding) -> usize {
-        self.shown.iter().filter(|shown| shown.finding() == Some(wanted)).count()
+    /// What comparisons of this rank have shown.
+    fn of_rank(&self, rank: usize) -> impl Iterator<Item = &UnmetLines> {
+        self.shown.iter().flatten().filter(move |lines| lines.rank() == rank)
     }
 
-    /// The median distance at which the lines miss each other, m.
-    fn median_miss(&self) -> Option<f64> {
-        let mut misses: Vec<f64> = self.shown.iter().filter_map(PairResult::miss_m).collect();
-        misses.sort_by(f64::total_cmp);
-        misses.get(misses.len() / 2).copied()
+    /// The one in the middle of those of a rank, by how far the lines miss each other.
+    fn typical(&self, rank: usize) -> Option<UnmetLines> {
+        let mut lines: Vec<UnmetLines> = self.of_rank(rank).copied().collect();
+        lines.sort_by(|one, other| one.miss_m().total_cmp(&other.miss_m()));
+        lines.get(lines.len() / 2).copied()
     }
 }
 
@@ -277,8 +266,8 @@ impl Unmet {
             if !is_new && now.seconds_since(pair.time) < INTERVAL_S {
                 continue;
             }
-            let shown = compared(&lines, &seen.lines, &self.passings);
-            counted.extend(shown.finding().map(PairFinding::counter));
+            let shown = compared(&lines, &seen.lines, &self.passings, self.max_range_m);
+            counted.extend(shown.as_ref().map(UnmetLines::counter));
             pair.time = now;
             pair.shown.push_back(shown);
             if pair.shown.len() > REMEMBERED {
@@ -333,41 +322,29 @@ impl Unmet {
     fn conclusion(&self) -> Option<WhyNothing> {
         let steady: Vec<(&[CameraName; 2], &PairComparisons)> =
             self.pairs.iter().filter(|(_, pair)| pair.is_steady()).collect();
-        let counts = |finding| steady.iter().map(move |(_, pair)| pair.count(finding));
-        let total = |finding: &PairFinding| -> usize { counts(*finding).sum() };
+        let count = |pair: &PairComparisons, rank| pair.of_rank(rank).count();
+        let total = |rank| -> usize { steady.iter().map(|(_, pair)| count(pair, rank)).sum() };
         // The commonest finding of all steady pairs, and of these pairs the one that shows it most
         // often.
-        let most =
-            PairFinding::ALL.into_iter().filter(|finding| total(finding) > 0).max_by_key(total)?;
-        let (cameras, pair) = steady.into_iter().max_by_key(|(_, pair)| pair.count(most))?;
-        let lines = match most {
-            PairFinding::Nowhere => UnmetLines::Nowhere { max_range_m: self.max_range_m },
-            PairFinding::Apart => UnmetLines::Apart { by_m: pair.median_miss()? },
-            PairFinding::Close => UnmetLines::Unsteady,
-            PairFinding::Together => UnmetLines::Together,
-        };
-        Some(WhyNothing { cameras: cameras.clone(), lines })
+        let shown = (0..UnmetLines::RANKS).filter(|rank| total(*rank) > 0);
+        let most = shown.max_by_key(|rank| total(*rank))?;
+        let (cameras, pair) = steady.iter().max_by_key(|(_, pair)| count(pair, most))?;
+        Some(WhyNothing { cameras: (*cameras).clone(), lines: pair.typical(most)? })
     }
 }
 
-/// What the two closest lines of two cameras do.
-fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> PairResult {
-    let (Some(first), Some(second)) = (one.first(), other.first()) else {
-        return PairResult::Nothing;
-    };
+/// What the two closest lines of two cameras do; `None` if one of them saw nothing.
+fn compared(
+    one: &[TimedLine],
+    other: &[TimedLine],
+    passings: &Passings,
+    max_range_m: f64,
+) -> Option<UnmetLines> {
+    let (first, second) = (one.first()?, other.first()?);
     if (first.line.origin - second.line.origin).norm() < SAME_PLACE_M {
-        return PairResult::Together;
+        return Some(UnmetLines::Together);
     }
-    let all = one.iter().flat_map(|first| other.iter().map(|second| passings.of(first, second)));
-    let closest = all.min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)));
-    closest.map_or(PairResult::Nothing, PairResult::Lines)
-}
-
-/// How far apart two lines count as passing each other, m.
-fn distance_m(passing: &Passing) -> f64 {
-    match passing {
-        Passing::Close => f64::NEG_INFINITY,
-        Passing::Apart { by_m } => *by_m,
-        Passing::Nowhere => f64::INFINITY,
-    }
+    let passing = |(first, second)| UnmetLines::of(passings.of(first, second), max_range_m);
+    let all = one.iter().flat_map(|first| other.iter().map(move |second| (first, second)));
+    all.map(passing).min_by(|a, b| a.miss_m().total_cmp(&b.miss_m()))
 }

@@ -8,21 +8,13 @@
 //! the two together tell the white part of a camera's noise from the lasting part, whatever the
 //! track believes.
 
-use std::f64::consts::LN_2;
-
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector2, Vector3};
 
+use crate::spatial::MEDIAN_OF_TWO;
 use crate::uncertainty::CorrelatedNoise;
 
-/// Median of a chi-square of two degrees of freedom, 2 ln 2: a property of the distribution, and
-/// no choice.
-const MEDIAN: f64 = 2.0 * LN_2;
-/// Increase of the share of draws below the median per unit of the logarithm of the scale: that
-/// distribution's density there. With half of it each step of the estimate is twice as long, and
-/// its error 1.4 times as large.
-const SLOPE: f64 = LN_2 / 2.0;
 /// Number of draws that the estimate remembers: it is then known to 13 %. With half as many a
 /// camera must report a third of its variance before that is noticed, and not half of it.
 const MEMORY: f64 = 200.0;
@@ -148,10 +140,12 @@ impl RunningScale {
     /// Takes a squared third difference in.
     fn see(&mut self, squared: f64) {
         self.draws = (self.draws + 1.0).min(MEMORY);
-        // A step towards the median, up or down: half a draw over the slope and the number of
-        // draws.
-        let above = if squared > MEDIAN * self.log_factor.exp() { 0.5 } else { -0.5 };
-        let next = self.log_factor + above / (SLOPE * self.draws.max(10.0));
+        // A step towards the median, up or down: half a draw over the number of draws and over the
+        // slope, by which the share of draws below the median m grows with the scale's logarithm:
+        // that is m / 4, the distribution's density there.
+        let above = if squared > MEDIAN_OF_TWO * self.log_factor.exp() { 0.5 } else { -0.5 };
+        let slope = MEDIAN_OF_TWO / 4.0;
+        let next = self.log_factor + above / (slope * self.draws.max(10.0));
         // Of labels that are interpolated all draws are next to nothing: what is below the least
         // that counts is not remembered.
         self.log_factor = next.max(LEAST_WHITE.ln());

@@ -9,12 +9,10 @@ use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 use super::batch_means::BatchMeans;
 use super::curve::{Basis, Curve, CurvePoint, TimedPlace};
 use super::window::WindowBearing;
+use crate::spatial::MEDIAN_OF_TWO;
 use robust::{BearingCost, OUTLIER, RobustCost};
 use target::{PlaceShift, PlaceShifts, PredictedTarget};
 
-/// Median of a squared distance of two degrees of freedom, 2 ln 2. With half of it cameras would be
-/// taken to have twice the variance that they have.
-const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
 /// Largest factor on a camera's covariances: larger residuals are due to a mistake, not to noise,
 /// and are not made likely by taking them for noise. With half of it a camera that reports a third
 /// of its noise never has its clock learnt.
@@ -170,7 +168,7 @@ impl<'a> Adjustment<'a> {
             let count = squares.len() as f64;
             let typical = match (cost, squares.get(squares.len() / 2)) {
                 (_, None) => continue,
-                (RobustCost::Huber, Some(median)) => median / MEDIAN,
+                (RobustCost::Huber, Some(median)) => median / MEDIAN_OF_TWO,
                 (RobustCost::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
             };
             // Up to three standard errors (of the median; four of the mean) above 1 are chance for

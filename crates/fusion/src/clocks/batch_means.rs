@@ -11,10 +11,12 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector2;
 
+use super::WINDOW_S;
+
 /// Length of a batch, s: a quarter of a window of the estimate. Errors that last longer are seen in
 /// part: with half of it, errors that last for a second leave clocks off by a half more of their
 /// stated deviations.
-const BATCH_S: f64 = 2.0;
+const BATCH_S: f64 = WINDOW_S / 4.0;
 /// Standard errors above 1 that are chance: there the factor stays 1, in a window of four batches
 /// up to 3. With half as many, a factor in twenty of independent residuals would be above 1.
 const CHANCE: f64 = 4.0;

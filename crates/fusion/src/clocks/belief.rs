@@ -28,7 +28,7 @@ const POSE_FLOOR: f64 = 1e-6;
 const INFLATION_WEIGHT: f64 = 0.25;
 /// Offsets are clamped to this, s: beyond it they are no offsets any more. With half of it a clock
 /// that is off by a second and a half stays off by half a second.
-const MAX_OFFSET_S: f64 = 2.0;
+pub(super) const MAX_OFFSET_S: f64 = 2.0;
 
 /// An uncertain camera pose: index of its error in the state, and its covariance as reported.
 #[derive(Clone, Copy, Debug)]

@@ -109,10 +109,6 @@ struct Round {
     cleared: BTreeSet<CameraName>,
 }
 
-/// Time over which a clock's random walk is counted, s: a clock that wanders by the least deviation
-/// within it is estimated. With half of it one that wanders 1.4 times as far is not.
-const WALK_S: f64 = WINDOW_S;
-
 /// Estimates the clocks of all cameras.
 #[derive(Clone, Debug)]
 pub(crate) struct ClockEstimator {
@@ -178,8 +174,8 @@ impl ClockEstimator {
         if !self.config.estimate {
             return;
         }
-        // sd of a random walk of density w after t: sqrt(w t).
-        let walks = (reported.clock_walk * WALK_S).sqrt();
+        // sd of a random walk of density w after the length t of a window: sqrt(w t).
+        let walks = (reported.clock_walk * WINDOW_S).sqrt();
         let uncertain = reported_sd_s.max(walks) >= self.config.least_sd_s
             && !self.config.trusted.contains(camera);
         let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };

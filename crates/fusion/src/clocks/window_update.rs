@@ -4,8 +4,9 @@
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::DMatrix;
 
+use super::WINDOW_S;
 use super::adjustment::{AdjustedCameras, Adjustment, ClockAndPosePrior, MAX_SCALE, Unknowns};
-use super::belief::Belief;
+use super::belief::{Belief, MAX_OFFSET_S};
 use super::curve::Curve;
 use super::window::TrackWindow;
 
@@ -37,9 +38,6 @@ const BETTER: f64 = 1.5;
 /// With half of it the bearings of a clock that is off by a second lie beyond the curve, where its
 /// end pieces are only continued.
 const MAX_MARGIN_S: f64 = 1.0;
-/// Longest window, s: it bounds the number of a curve's pieces. With half of it the last bearings
-/// of a full window, of 8 s and its margins, lie beyond the curve.
-const LONGEST_S: f64 = 12.0;
 /// Jerk density that is tried first, m^2/s^5, as a power of ten: a small drone's. Each power
 /// between it and the best one costs a descent; with half of the density the best one is the same.
 const FIRST_DENSITY: i32 = 0;
@@ -346,7 +344,8 @@ fn adjust(
     let precision: DMatrix<f64> = covariance.cholesky()?.inverse();
     let epoch_s = belief.epoch()?.seconds_since(window.start);
     let prior = ClockAndPosePrior { mean, precision, epoch_s, cameras };
-    let reach = LONGEST_S + 2.0 * MAX_MARGIN_S;
+    // No clock is farther off than `MAX_OFFSET_S`, either way.
+    let reach = WINDOW_S + 2.0 * (MAX_OFFSET_S + MAX_MARGIN_S);
     let curve = Curve::over(first, last.min(first + reach));
     Adjustment::new(&window.sights, curve, &prior, inflations).solve(FIRST_DENSITY)
 }

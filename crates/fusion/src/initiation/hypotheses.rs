@@ -14,6 +14,7 @@ use super::selection::{PeriodLine, ScoredLines, Selection};
 use super::{NamedLine, NewTrack, lines_of};
 use crate::cameras::Rooted;
 use crate::cameras::{Cameras, KnownCamera};
+use crate::evidence::BEYOND_DOUBT;
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
 use crate::track::{FusedTrack, StartLine, TrackBearing, TrackExpectation, TrackId, TrackStatus};
@@ -44,9 +45,6 @@ const BOUNDS: HypothesisBounds =
 /// A hypothesis with a smaller log-likelihood ratio than this is clutter. A seed of two cameras may
 /// begin below zero: with half of it the first misses end a new target there.
 const LEAST_SCORE: f64 = -12.0;
-/// While another explanation of the same bearings is within this log-likelihood of the best (a
-/// chance of 1 in 3000), nothing is confirmed. With half of it (1 in 50) ghosts are confirmed.
-const RIVAL_MARGIN: f64 = 8.0;
 
 /// One hypothesis: that these bearings are one target's.
 #[derive(Clone, Debug)]
@@ -132,7 +130,7 @@ impl Hypothesis {
         });
         let choices: f64 = choices.sum();
         let moves = cameras.iter().any(|camera| rooted(camera) == Rooted::No);
-        if moves { choices } else { choices + RIVAL_MARGIN }
+        if moves { choices } else { choices + BEYOND_DOUBT }
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {
@@ -277,13 +275,13 @@ impl Hypotheses {
         near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         // The likeliest continuation, with a bearing or without.
         let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
-        near.retain(|(ratio, _)| *ratio > miss && *ratio > best - RIVAL_MARGIN);
+        near.retain(|(ratio, _)| *ratio > miss && *ratio > best - BEYOND_DOUBT);
         near.truncate(BOUNDS.branches);
         let before = next.len();
         next.extend(near.into_iter().filter_map(|(ratio, index)| {
             self.continued_with(index, ratio, hypothesis.clone(), context, prediction.as_ref())
         }));
-        if miss <= best - RIVAL_MARGIN && next.len() > before {
+        if miss <= best - BEYOND_DOUBT && next.len() > before {
             return;
         }
         if expected {
@@ -397,7 +395,7 @@ impl Hypotheses {
         let likely = selection.chosen().filter(|&i| self.is_likely(&self.hypotheses[i], lines));
         let has_no_rival = |&i: &usize| {
             let own = state(i);
-            selection.margin_of(i, |k| same_target(&own, &state(k))) >= RIVAL_MARGIN
+            selection.margin_of(i, |k| same_target(&own, &state(k))) >= BEYOND_DOUBT
         };
         let sure: Vec<usize> = likely.filter(has_no_rival).collect();
         let lines: BTreeSet<LineId> = sure

@@ -7,15 +7,12 @@ use nalgebra::Point3;
 
 use super::NamedLine;
 use super::sight::DirectionFilter;
+use crate::evidence::ONE_IN_A_HUNDRED;
 use crate::prediction::BearingPrediction;
 use crate::spatial::{LineId, TYPICAL_SPEED, TimedLine};
 use crate::track::TrackBearing;
 use crate::visibility::independent_share;
 
-/// Logarithm of the probability that a camera never detects a target that it should see: the most
-/// that its misses count. With half of it the second look of a camera that sees nothing no longer
-/// counts; with twice as much a target that a tree hides from one camera is found later.
-const LOG_NEVER_DETECTED: f64 = -4.6;
 /// If the clock's uncertainty shifts a camera's bearings by a variance of more than this many times
 /// their own, the test says nothing. With half of it clocks that are 0.7 times as uncertain let
 /// lines that cross by chance pass untested.
@@ -133,11 +130,12 @@ impl OneTargetTest {
         if self.sights.iter().any(|(name, _)| name == camera) {
             return;
         }
-        // Exposures close together count as one look.
+        // Exposures close together count as one look, and all of them no more than that the camera
+        // never detects this target.
         let more = log_miss * independent_share(interval_s);
         match self.silent.iter_mut().find(|(name, _)| name == camera) {
-            Some((_, log)) => *log = (*log + more).max(LOG_NEVER_DETECTED),
-            None => self.silent.push((camera.clone(), more.max(LOG_NEVER_DETECTED))),
+            Some((_, log)) => *log = (*log + more).max(ONE_IN_A_HUNDRED),
+            None => self.silent.push((camera.clone(), more.max(ONE_IN_A_HUNDRED))),
         }
     }
 

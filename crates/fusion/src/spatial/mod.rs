@@ -7,6 +7,8 @@
 mod map;
 mod observability;
 
+use std::f64::consts::LN_2;
+
 use crossfix_filter::KinematicState;
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
@@ -108,6 +110,10 @@ pub(crate) const TYPICAL_SPEED: f64 = 0.3;
 /// Standard deviation of an uninformative velocity prior, m/s per axis: faster than any UAV. With
 /// half of it a velocity that bearings determine to between 50 and 100 m/s counts as unobserved.
 pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;
+
+/// Median of a chi-square of two degrees of freedom, 2 ln 2: a property of the distribution, and
+/// no choice.
+pub(crate) const MEDIAN_OF_TWO: f64 = 2.0 * LN_2;
 
 /// The squared Mahalanobis distance within which a true value of `dimensions` lies with probability
 /// `p`.

@@ -8,10 +8,6 @@ use super::{FusedTrack, TrackBearing};
 use crate::spatial::{Observability, VAGUE_VELOCITY_SD};
 use crate::uncertainty::CameraUncertainty;
 
-/// How often a track's observability is computed again, s: the eigenvalues cost more than an
-/// update. With half of it they cost twice as much; with twice as much, what can no longer be
-/// observed is said a second later.
-const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
 /// Time constant with which the Fisher information of past bearings fades, s. With half of it the
 /// last bearing but one of a camera of 1 Hz keeps 13 % of its weight and not 37 %; with twice as
 /// much a lost camera counts for twice as long.
@@ -51,9 +47,10 @@ impl FusedTrack {
             if next.iter().all(|value| value.is_finite()) { next } else { Matrix6::zeros() };
     }
 
-    /// Computes the observability again if that was last done [`OBSERVABILITY_INTERVAL_S`] ago.
+    /// Computes the observability again if that was last done [`INFORMATION_S`] ago: until then most
+    /// of the information is the same, and the eigenvalues cost more than an update.
     pub(crate) fn observe_again(&mut self) {
-        if self.updated_at.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
+        if self.updated_at.seconds_since(self.observed) >= INFORMATION_S {
             self.observe();
         }
     }

@@ -8,8 +8,8 @@ use super::{Noted, TrackChange, Tracker};
 use crate::assignment::{Pairing, assign};
 use crate::cameras::Fitting;
 use crate::cameras::KnownCamera;
+use crate::evidence::BEYOND_DOUBT;
 use crate::motion::MotionSetup;
-use crate::reacquisition::FOUND_AGAIN_MARGIN;
 use crate::track::{FusedTrack, TrackId, TrackStatus};
 use crate::visibility::log_missed;
 use crate::{Exposure, Sighting, Tracking};
@@ -106,7 +106,7 @@ impl Tracker {
     ) -> Vec<Pairing> {
         // Least log-density of a bearing that is to update a track which this camera has lost sight
         // of.
-        let least_log_density = exposure.clutter_per_sr.ln() + FOUND_AGAIN_MARGIN;
+        let least_log_density = exposure.clutter_per_sr.ln() + BEYOND_DOUBT;
         let origin = known.camera.pose().position();
         let mut candidates = Vec::new();
         for (row, track) in

@@ -5,6 +5,7 @@ use nalgebra::Point3;
 
 use super::{TrackChange, Tracker, mahalanobis_squared, same_target};
 use crate::cameras::{Cameras, KnownCamera};
+use crate::evidence::ONE_IN_A_HUNDRED;
 use crate::initiation::NewTrack;
 use crate::motion::MotionSetup;
 use crate::track::{FusedTrack, TrackId, TrackStatus};
@@ -13,9 +14,6 @@ use crate::track::{FusedTrack, TrackId, TrackStatus};
 /// are one target. With half of it the two ends of a target make two tracks; with twice as much,
 /// targets in formation become one.
 const SMALLEST_TARGET_PX: f64 = 7.0;
-/// A track whose score falls below this is ended: odds of 1 in 100 against clutter. With half of it
-/// (1 in 10) a young target that is missed a few times has to be found again.
-const DROP_SCORE: f64 = -4.6;
 /// A new track is compared with the older ones at this interval, s, ...
 const COMPARED_EVERY_S: f64 = 1.0;
 /// ... this many times: by then its position is well known, and two targets that fly side by side
@@ -38,7 +36,7 @@ impl Tracker {
                     && position_sd(track, now, &self.motion) > self.config.max_position_sd_m);
             match track.status {
                 TrackStatus::Lost => {}
-                _ if hopeless || track.score < DROP_SCORE => {
+                _ if hopeless || track.score < ONE_IN_A_HUNDRED => {
                     track.status = TrackStatus::Lost;
                     changes.push(TrackChange::new(TrackEventKind::Lost, track.id));
                 }

@@ -22,16 +22,13 @@ use self::seen::{SeenDirection, pose_variance};
 use super::{NewTrack, lines_with_pose};
 use crate::cameras::{KnownCamera, Rooted};
 use crate::cueing::CueTarget;
+use crate::evidence::BEYOND_DOUBT;
 use crate::motion::MotionSetup;
 use crate::spatial::{LineId, TimedLine};
 use crate::track::{FusedTrack, TrackStatus};
 use crate::tracker::{UsedSighting, same_target};
 use crate::{Exposure, FusionConfig};
 
-/// A reading is confirmed if one target is likelier by this log-likelihood ratio than each camera
-/// seeing another target, and than any other reading of the same lines: a chance of 1 in 3000. With
-/// half of it (1 in 50) other targets are taken for it.
-const MARGIN: f64 = 8.0;
 /// A reading with a smaller log-likelihood ratio than this is given up. With half of it more true
 /// readings end with their first line, and none is tried again.
 const GIVEN_UP: f64 = -5.0;
@@ -158,8 +155,8 @@ impl Handover {
             let fits = near.filter_map(|(i, sighting)| {
                 Some((sight.density(&sighting.line, factor, gate)?, i))
             });
-            let fits =
-                fits.filter(|(fit, i)| !is_lost || (!is_known(*i) && *fit > clutter + MARGIN));
+            let fits = fits
+                .filter(|(fit, i)| !is_lost || (!is_known(*i) && *fit > clutter + BEYOND_DOUBT));
             let best = fits.max_by(|a, b| a.0.total_cmp(&b.0));
             let Some((log_density, index)) = best else {
                 one.missed += 1.0;
@@ -234,8 +231,9 @@ impl Handover {
         }
     }
 
-    /// Confirms the readings that this exposure has made sure. Other readings of the same lines are
-    /// rivals, unless they give the same target.
+    /// Confirms the readings that this exposure has put beyond doubt: one target is likelier than
+    /// each camera seeing another target, and than any other reading of the same lines, unless that
+    /// gives the same target.
     fn settle(&mut self, context: &ReadingContext<'_>) -> Vec<NewTrack> {
         let ReadingContext { exposure, motion, .. } = *context;
         let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
@@ -244,7 +242,9 @@ impl Handover {
         let mut sure: Vec<&Reading> = all
             .iter()
             .copied()
-            .filter(|one| one.is_of(exposure) && one.ratio() >= MARGIN && one.track.is_placed())
+            .filter(|one| {
+                one.is_of(exposure) && one.ratio() >= BEYOND_DOUBT && one.track.is_placed()
+            })
             .filter(|one| rivals(one, &all).all(|other| same_target(&state(one), &state(other))))
             .collect();
         sure.sort_by(|one, other| other.ratio().total_cmp(&one.ratio()));
@@ -272,7 +272,7 @@ impl Handover {
 /// The readings that are nearly as likely as one, or likelier, and share its newest line or the
 /// direction that was followed first; itself among them.
 fn rivals<'a>(one: &'a Reading, all: &'a [&'a Reading]) -> impl Iterator<Item = &'a Reading> + 'a {
-    let near = all.iter().copied().filter(|other| other.ratio() > one.ratio() - MARGIN);
+    let near = all.iter().copied().filter(|other| other.ratio() > one.ratio() - BEYOND_DOUBT);
     near.filter(|other| other.newest == one.newest || other.of == one.of)
 }
 

@@ -12,6 +12,7 @@ use super::super::sight::DirectionFilter;
 use super::Rules;
 use super::reading::{Reading, ReadingContext};
 use crate::cueing::CueTarget;
+use crate::evidence::ONE_IN_A_HUNDRED;
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
 use crate::track::FusedTrack;
@@ -29,10 +30,6 @@ const TURNING_DENSITY: f64 = 3e-4;
 /// ranges over a factor of 150 were equally likely. With half of it (a factor of 12) lines that
 /// cross by chance gain 0.7 in log-likelihood.
 const UNKNOWN_LOG_RANGE_SD: f64 = 2.0;
-/// A camera has lost sight of a direction if the probability of missing it that often by chance is
-/// below exp of this: once in 100 times, which is two exposures of a camera that reports nine of
-/// ten. With half of it a single miss is a loss.
-const LOST: f64 = -4.6;
 
 /// A direction that one camera alone follows, at the time of its last line.
 #[derive(Clone, Debug)]
@@ -90,7 +87,7 @@ impl SeenDirection {
         // The camera's own share of detections so far; n misses have the probability (1 - share)^n.
         let share = (self.lines / (self.lines + self.gaps)).min(tracking.detection_probability);
         let is_silent = now.seconds_since(self.sight.time) > tracking.coasting_after_s;
-        is_silent || self.missed * (1.0 - share).ln() <= LOST
+        is_silent || self.missed * (1.0 - share).ln() <= ONE_IN_A_HUNDRED
     }
 
     /// Whether it is confirmed to be something, and not the camera's false alarms.
