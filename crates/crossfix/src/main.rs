@@ -26,6 +26,7 @@ mod network;
 #[cfg(feature = "onvif")]
 mod onvif;
 mod output;
+mod overwriting;
 mod pace;
 mod parts;
 #[cfg(feature = "centre")]
@@ -71,10 +72,15 @@ fn main() -> ExitCode {
     network::give_zenoh_threads();
     // clap handles wrong arguments itself, with exit code 2; contradictions that it cannot see end
     // with 2, too.
-    let matches = takes_negative_numbers(Cli::command()).get_matches();
+    let command = takes_negative_numbers(Cli::command());
+    let matches = command.clone().get_matches();
     let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
     logging::start(&cli.logging);
-    match shutdown::supervise(move || cli.command.run()) {
+    let run = move || {
+        overwriting::check(&command, &matches)?;
+        cli.command.run()
+    };
+    match shutdown::supervise(run).and_then(|()| output::ensure_written()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             output::error(&error);

@@ -3,14 +3,36 @@
 use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use serde::Serialize;
 
-/// Writes a line of the result. A reader that has gone away (`| head`) is not an error.
+/// Why a line of the result could not be written, the first time.
+static UNWRITTEN: OnceLock<io::Error> = OnceLock::new();
+
+/// Writes a line of the result. A reader that has gone away (`| head`) is not an error; any other
+/// is one of the whole command: see [`ensure_written`].
 pub fn line(text: impl std::fmt::Display) {
-    let _ = writeln!(io::stdout().lock(), "{text}");
+    note_written(writeln!(io::stdout().lock(), "{text}"));
+}
+
+fn note_written(written: io::Result<()>) {
+    if let Err(error) = written
+        && error.kind() != io::ErrorKind::BrokenPipe
+    {
+        // What follows is lost for the same reason.
+        let _ = UNWRITTEN.set(error);
+    }
+}
+
+/// Fails if a line of the result could not be written.
+pub fn ensure_written() -> anyhow::Result<()> {
+    note_written(io::stdout().flush());
+    match UNWRITTEN.get() {
+        None => Ok(()),
+        Some(error) => bail!("cannot write the result: {error}"),
+    }
 }
 
 /// Writes a result as JSON.
