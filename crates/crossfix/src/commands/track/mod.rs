@@ -131,13 +131,19 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     if let Some(path) = &args.csv {
         output::line(format!(
-            "{} frames tracked, boxes written to {}",
+            "{} frames tracked, {} of them with a target, boxes written to {}",
             counted.tracked,
+            counted.with_target,
             path.display()
         ));
     }
     ensure!(
-        counted.with_target > 0 || counted.is_stopped,
+        !counted.is_stopped,
+        "stopped after {} frames: what is written ends there",
+        counted.length
+    );
+    ensure!(
+        counted.with_target > 0,
         "no target was found in the {} frames of {}",
         counted.tracked,
         args.video.display()
