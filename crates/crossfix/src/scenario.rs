@@ -14,17 +14,15 @@ pub struct ExposureRow {
     pub t: f64,
     pub cam: u32,
     pub scan: u64,
-    /// Number of its bearings; not needed for reading.
-    #[serde(default)]
-    pub n: usize,
+    /// Number of its bearings; need not be there.
+    pub n: Option<usize>,
 }
 
 /// A bearing of one exposure.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct DetectionRow {
-    /// Capture time, s; the exposure's own time takes precedence.
-    #[serde(default)]
-    pub t: f64,
+    /// Capture time of the exposure, s; need not be there.
+    pub t: Option<f64>,
     pub cam: u32,
     pub scan: u64,
     /// The bearing's number within the exposure.

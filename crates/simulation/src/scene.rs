@@ -9,6 +9,9 @@ use thiserror::Error;
 
 use crate::{FlightPath, SceneClutter, SceneMount, SimulatedClock, World};
 
+/// Longest scene, s, and the farthest from its start that anything in it begins.
+const LONGEST_S: f64 = 1e5;
+
 /// A scene as it is written in a file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -164,7 +167,7 @@ impl Scene {
         check_number(
             "duration_s".into(),
             lasts,
-            is_positive(lasts) && lasts < 1e5,
+            is_positive(lasts) && lasts < LONGEST_S,
             "from 0 to 100000 s",
         )?;
         let mut seen = BTreeSet::new();
@@ -189,6 +192,8 @@ impl SceneTarget {
     fn check(&self) -> Result<(), SceneError> {
         let span = format!("span_m of target {}", self.id);
         check_number(span, self.span_m, is_positive(self.span_m), "a positive number of metres")?;
+        let appears = format!("appears_s of target {}", self.id);
+        check_range(appears, self.appears_s, -LONGEST_S..=LONGEST_S, "within 100000 s")?;
         if self.path.is_possible() { Ok(()) } else { Err(SceneError::Path { target: self.id }) }
     }
 }
@@ -204,6 +209,10 @@ impl SceneCamera {
         self.check_range("noise_levels", self.noise_levels, 0.0..=100.0, "from 0 to 100 levels")?;
         self.check_range("blur_px", self.blur_px, 0.0..=20.0, "from 0 to 20 px")?;
         self.check_range("exposure_s", self.exposure_s, 0.0..=1.0, "from 0 to 1 s")?;
+        self.check_range("phase_s", self.phase_s, 0.0..=LONGEST_S, "from 0 to 100000 s")?;
+        let SimulatedClock { offset_s, drift_ppm } = self.clock;
+        self.check_range("clock.offset_s", offset_s, -1e9..=1e9, "within 1000000000 s")?;
+        self.check_range("clock.drift_ppm", drift_ppm, -1e5..=1e5, "within 100000 ppm")?;
         if let Some(SceneMount { rate_deg_per_s: rate, angle_sd_mrad: sd, .. }) = self.mount {
             let turns = "from 0.01 to 1000 degrees a second";
             self.check_range("mount.rate_deg_per_s", rate, 0.01..=1000.0, turns)?;

@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pose};
 use crossfix_message::{
     BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
@@ -21,6 +21,8 @@ use crate::scenario::{DetectionRow, ExposureRow, FORMAT, TruthRow, turned};
 #[derive(Debug, Deserialize)]
 struct Scenario {
     format: String,
+    /// When to score; with none, whenever there is truth.
+    #[serde(default)]
     epochs_s: Vec<f64>,
     cameras: Vec<ScenarioCamera>,
 }
@@ -55,11 +57,20 @@ pub fn read(dir: &Path) -> anyhow::Result<Vec<Entry>> {
         scenario.format
     );
     let site: SiteName = "scenario".parse()?;
-    let mut entries = Vec::new();
+    let (mut entries, mut cameras) = (Vec::new(), BTreeSet::new());
     for camera in &scenario.cameras {
+        ensure!(
+            cameras.insert(camera.id),
+            "{}: two cameras have the id {}",
+            description.display(),
+            camera.id
+        );
         entries.push(calibration(&site, camera)?);
     }
-    entries.extend(bearings(dir, &site)?);
+    entries.extend(
+        bearings(dir, &site, &cameras)
+            .with_context(|| format!("the tables of {} do not agree", dir.display()))?,
+    );
     entries.extend(truth(dir, &site, &scenario)?);
     Ok(entries)
 }
@@ -91,29 +102,65 @@ fn calibration(site: &SiteName, camera: &ScenarioCamera) -> anyhow::Result<Entry
     ))
 }
 
-fn bearings(dir: &Path, site: &SiteName) -> anyhow::Result<Vec<Entry>> {
-    let mut tracks: BTreeMap<(u32, u64), Vec<BearingTrack>> = BTreeMap::new();
+/// The bearings of all exposures. The tables must agree: half a table is no scenario.
+fn bearings(dir: &Path, site: &SiteName, cameras: &BTreeSet<u32>) -> anyhow::Result<Vec<Entry>> {
+    let mut detections: BTreeMap<(u32, u64), Vec<DetectionRow>> = BTreeMap::new();
     for row in read_csv::<DetectionRow>(&dir.join("detections.csv"))? {
-        let direction: WireVector = turned(Vector3::new(row.ux, row.uy, row.uz)).into();
-        tracks.entry((row.cam, row.scan)).or_default().push(BearingTrack {
-            // The detections of a scan are not tracks: each gets a number that is not used again in
-            // the next scan.
-            track_id: row.scan * 1000 + row.det,
-            bearing: Some(direction),
-            covariance_xx: row.sigma_rad.powi(2),
-            covariance_yy: row.sigma_rad.powi(2),
-            score: 1.0,
-            state: ImageTrackState::Tracking.into(),
-            ..Default::default()
-        });
+        ensure_possible(&row)
+            .with_context(|| format!("detections.csv, camera {}, scan {}", row.cam, row.scan))?;
+        detections.entry((row.cam, row.scan)).or_default().push(row);
     }
-    let exposures = read_csv::<ExposureRow>(&dir.join("exposures.csv"))?.into_iter();
-    exposures
-        .map(|row| {
-            let detections = tracks.remove(&(row.cam, row.scan)).unwrap_or_default();
-            exposure(site, &row, detections)
-        })
-        .collect()
+    let mut entries = Vec::new();
+    for row in read_csv::<ExposureRow>(&dir.join("exposures.csv"))? {
+        let ExposureRow { t, cam, scan, n } = row;
+        let own = detections.remove(&(cam, scan)).unwrap_or_default();
+        let of = format!("exposures.csv, camera {cam}, scan {scan}");
+        ensure!(cameras.contains(&cam), "{of}: scenario.json has no such camera");
+        ensure!(t.is_finite(), "{of}: t is {t}");
+        if let Some(n) = n {
+            ensure!(n == own.len(), "{of}: n is {n}, and detections.csv has {} rows", own.len());
+        }
+        let other = own.iter().filter_map(|row| row.t).find(|own| (own - t).abs() > same_s(t));
+        if let Some(other) = other {
+            bail!("{of}: t is {t}, and {other} in detections.csv");
+        }
+        entries.push(exposure(site, &row, own.iter().map(track).collect())?);
+    }
+    if let Some((cam, scan)) = detections.keys().next() {
+        bail!("detections.csv, camera {cam}, scan {scan}: exposures.csv has no such row");
+    }
+    Ok(entries)
+}
+
+/// Times that differ by less are the same, s: tables may hold nine digits.
+fn same_s(t: f64) -> f64 {
+    1e-6 + 1e-8 * t.abs()
+}
+
+fn ensure_possible(row: &DetectionRow) -> anyhow::Result<()> {
+    let &DetectionRow { ux, uy, uz, sigma_rad, .. } = row;
+    let length = Vector3::new(ux, uy, uz).norm();
+    ensure!((length - 1.0).abs() < 1e-3, "ux, uy, uz have the length {length}, and not 1");
+    ensure!(
+        sigma_rad > 0.0 && sigma_rad < 0.5,
+        "sigma_rad is {sigma_rad}: it must be from 0 to 0.5 rad"
+    );
+    Ok(())
+}
+
+fn track(row: &DetectionRow) -> BearingTrack {
+    let direction: WireVector = turned(Vector3::new(row.ux, row.uy, row.uz)).into();
+    BearingTrack {
+        // The detections of a scan are not tracks: each gets a number that is not used again in the
+        // next scan.
+        track_id: row.scan.wrapping_mul(1000).wrapping_add(row.det),
+        bearing: Some(direction),
+        covariance_xx: row.sigma_rad.powi(2),
+        covariance_yy: row.sigma_rad.powi(2),
+        score: 1.0,
+        state: ImageTrackState::Tracking.into(),
+        ..Default::default()
+    }
 }
 
 /// The message of one exposure.
@@ -140,16 +187,27 @@ fn truth(dir: &Path, site: &SiteName, scenario: &Scenario) -> anyhow::Result<Vec
     let epochs: BTreeSet<Timestamp> =
         scenario.epochs_s.iter().map(|&t| Timestamp::from_seconds(t)).collect();
     let mut frames: BTreeMap<Timestamp, Vec<TrueState>> = BTreeMap::new();
+    let mut is_empty = true;
     for row in read_csv::<TruthRow>(&dir.join("truth.csv"))? {
-        let time = Timestamp::from_seconds(row.t);
-        if epochs.contains(&time) {
+        let TruthRow { t, id, x, y, z, vx, vy, vz } = row;
+        ensure!(
+            [t, x, y, z, vx, vy, vz].iter().all(|number| number.is_finite()),
+            "truth.csv, target {id} at {t}: a number is not finite"
+        );
+        is_empty = false;
+        let time = Timestamp::from_seconds(t);
+        if epochs.is_empty() || epochs.contains(&time) {
             frames.entry(time).or_default().push(TrueState {
-                id: row.id,
-                position: Some(WireVector { x: row.x, y: row.y, z: row.z }),
-                velocity: Some(WireVector { x: row.vx, y: row.vy, z: row.vz }),
+                id,
+                position: Some(WireVector { x, y, z }),
+                velocity: Some(WireVector { x: vx, y: vy, z: vz }),
             });
         }
     }
+    ensure!(
+        is_empty || !frames.is_empty(),
+        "no row of truth.csv is at one of the times of epochs_s in scenario.json"
+    );
     let key = Key::new(site.clone(), Channel::Truth);
     let entries = frames.into_iter().map(|(time, targets)| {
         let frame = TruthFrame { time_ns: time.nanos(), targets, ..Default::default() };

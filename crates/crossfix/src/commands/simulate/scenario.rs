@@ -131,7 +131,7 @@ pub fn write(site: &SimulatedSite, dir: &Path, shutdown: &Shutdown) -> anyhow::R
             let truth_id = source.map_or(-1, |id| id as i64);
             let sigma_rad = track.covariance_xx.sqrt();
             detections.rows.serialize(DetectionRow {
-                t,
+                t: Some(t),
                 cam,
                 scan,
                 det: det as u64,
@@ -142,7 +142,8 @@ pub fn write(site: &SimulatedSite, dir: &Path, shutdown: &Shutdown) -> anyhow::R
                 truth_id,
             })?;
         }
-        exposures.rows.serialize(ExposureRow { t, cam, scan, n: exposure.frame.tracks.len() })?;
+        let n = Some(exposure.frame.tracks.len());
+        exposures.rows.serialize(ExposureRow { t, cam, scan, n })?;
         for target in site.truth(exposure.time_s) {
             let (p, v) = (target.position, target.velocity);
             truth.rows.serialize(TruthRow {
