@@ -178,6 +178,9 @@ struct LatelySeen {
     lines: Vec<TimedLine>,
     /// By its image tracks.
     followed: BTreeMap<u64, FollowedTime>,
+    first: Timestamp,
+    /// Whether it has ever followed anything for [`SOMETHING_S`].
+    follows: bool,
 }
 
 /// Two cameras' last comparisons.
@@ -295,7 +298,13 @@ impl Unmet {
     /// lines.
     fn note(&mut self, exposure: &Exposure) -> Vec<TimedLine> {
         let now = exposure.time;
-        let nothing = || LatelySeen { time: now, lines: Vec::new(), followed: BTreeMap::new() };
+        let nothing = || LatelySeen {
+            time: now,
+            lines: Vec::new(),
+            followed: BTreeMap::new(),
+            first: now,
+            follows: false,
+        };
         let seen = self.seen.entry(exposure.camera.clone()).or_insert_with(nothing);
         seen.followed.retain(|_, followed| now.seconds_since(followed.last) <= SOMETHING_S);
         let mut lines = Vec::new();
@@ -309,7 +318,14 @@ impl Unmet {
             let begun = FollowedTime { first: now, last: now };
             let followed = seen.followed.entry(*image_track).or_insert(begun);
             followed.last = now;
-            if now.seconds_since(followed.first) >= SOMETHING_S && lines.len() < BOUNDS.lines {
+            let is_followed = now.seconds_since(followed.first) >= SOMETHING_S;
+            seen.follows |= is_followed;
+            // Software that numbers the bearings of each image anew follows nothing. Where image
+            // after image shows one or two, they are of something: clutter is more, or is missing.
+            let is_all = !seen.follows
+                && now.seconds_since(seen.first) >= 2.0 * SOMETHING_S
+                && exposure.sightings.len() <= 2;
+            if (is_followed || is_all) && lines.len() < BOUNDS.lines {
                 lines.push(timed);
             }
         }

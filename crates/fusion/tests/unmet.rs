@@ -109,6 +109,22 @@ fn clutter_is_not_something() {
 }
 
 #[test]
+fn a_wrong_pose_is_said_where_bearings_are_numbered_anew_in_each_image() {
+    let scene = two_cameras();
+    let (fusion, _) = said(&scene, |frame| {
+        let turn = if frame.camera == "b" { 0.4 } else { 0.0 };
+        for track in &mut frame.tracks {
+            track.track_id = frame.sequence * 1000;
+            let turned = Rotation3::from_euler_angles(turn, 0.0, 0.0)
+                * Vector3::from(track.bearing.unwrap());
+            track.bearing = Some(turned.into());
+        }
+    });
+    let why = fusion.why_nothing().unwrap();
+    assert!(matches!(why.lines, UnmetLines::Apart { .. }), "{why:?}");
+}
+
+#[test]
 fn cameras_whose_poses_are_copies_are_said() {
     let scene = two_cameras();
     // Both see the target from where they are, but the fusion centre is told one place for both.
