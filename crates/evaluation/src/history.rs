@@ -10,6 +10,11 @@ use crate::Estimate;
 /// s. With half of it a camera with two frames per second would drop out whenever it misses one.
 const LATELY_S: f64 = 1.0;
 
+/// A statement holds for so long, s. Every track is stated at least each half second as long as
+/// there are data; later than this the data have ended, and nobody says where the target is. With
+/// half of it a site of one frame in five seconds has answers only half of the time.
+const HOLDS_S: f64 = 10.0;
+
 /// Record of a run's `TrackFrame`s: the causal answer to "where was each track at time t".
 ///
 /// A frame has the tracks that an exposure has changed; the others continue as last stated.
@@ -62,11 +67,19 @@ impl TrackHistory {
         estimates
     }
 
+    /// Time of the first and of the last statement; `None` without any.
+    pub fn span(&self) -> Option<[Timestamp; 2]> {
+        Some([*self.times.first()?, *self.times.last()?])
+    }
+
     /// The same with tentative tracks, and those that a single camera follows: a direction whose
     /// range is a guess.
     pub fn all_at(&self, time: Timestamp) -> Vec<Estimate> {
         let said = self.tracks.iter().filter_map(|(&id, said)| {
             let (&then, said) = said.range(..=time).next_back()?;
+            if time.seconds_since(then) > HOLDS_S {
+                return None;
+            }
             let state = said.state.as_ref()?.predicted(time.seconds_since(then), 0.0);
             let lately = |bearing: &&Timestamp| time.seconds_since(**bearing) <= LATELY_S;
             let cameras = said.bearings.iter().filter(lately).count();

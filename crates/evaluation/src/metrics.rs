@@ -31,6 +31,13 @@ pub struct TrueTarget {
     pub velocity: Vector3<f64>,
 }
 
+impl TrueTarget {
+    /// Whether all numbers are finite.
+    pub fn is_finite(&self) -> bool {
+        self.position.coords.iter().chain(self.velocity.iter()).all(|number| number.is_finite())
+    }
+}
+
 /// A track's estimate of a target at an instant.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimate {

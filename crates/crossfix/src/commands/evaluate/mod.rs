@@ -124,6 +124,19 @@ impl EvaluatedRun {
         estimates
     }
 
+    /// Refuses tracks and truth of different times: nothing can be said of either.
+    fn ensure_overlaps(&self, truth: &[Timestamp]) -> anyhow::Result<()> {
+        let (Some([first, last]), [begins, .., ends]) = (self.tracks.span(), truth) else {
+            return Ok(());
+        };
+        ensure!(
+            first <= *ends && *begins <= last,
+            "the tracks are from {first} to {last}, the truth from {begins} to {ends}: they have no \
+             time in common"
+        );
+        Ok(())
+    }
+
     fn read(&mut self, path: &Path, smoothed: bool) -> anyhow::Result<Lacks> {
         let mut lacks = Lacks::default();
         recorded::for_each(path, &mut lacks, |lacks, entry| {
@@ -194,8 +207,14 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
         recording.display()
     );
     run.truth.sort_by_key(|frame| frame.time_ns);
+    let is_finite = |state: &TrueState| target(state).is_none_or(|target| target.is_finite());
+    ensure!(
+        run.truth.iter().flat_map(|frame| &frame.targets).all(is_finite),
+        "the truth has a position or a velocity that is no number"
+    );
     let times: Vec<Timestamp> =
         run.truth.iter().map(|f| Timestamp::from_nanos(f.time_ns)).collect();
+    run.ensure_overlaps(&times)?;
     let start = times[0].plus_seconds(question.skip_s);
     let mut evaluator = Evaluator::new(question.cutoff_m);
     for ((frame, &time), cameras) in

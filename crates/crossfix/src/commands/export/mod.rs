@@ -93,6 +93,7 @@ fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
             for row in reader.deserialize() {
                 let TimeRow { t } =
                     row.with_context(|| format!("{} needs a column `t`", path.display()))?;
+                ensure!(t.is_finite(), "{}: a time is {t}", path.display());
                 table.write(t, &at(Timestamp::from_seconds(t)))?;
             }
         }
