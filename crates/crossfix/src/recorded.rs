@@ -1,5 +1,6 @@
 //! Reading recordings, and reporting what is missing in them.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use anyhow::ensure;
@@ -18,7 +19,13 @@ pub struct Lacks {
     pub unreadable: u64,
     /// Why the first of them could not be read.
     pub first_unreadable: Option<String>,
+    /// Topics whose messages are left out: they begin as ours, but a name in them is not possible.
+    #[serde(skip_serializing_if = "BTreeSet::is_empty")]
+    pub misnamed: BTreeSet<String>,
 }
+
+/// What is wrong with a topic that begins as ours.
+pub const NO_NAME: &str = "a name of a site or camera has letters, digits, `-` and `_`";
 
 impl Lacks {
     /// Decodes a message, or counts that it cannot be read.
@@ -42,6 +49,9 @@ impl Lacks {
     pub fn say(&self, path: &Path) {
         if let Some(damage) = &self.damage {
             tracing::warn!("{} is damaged {damage}; everything else was read", path.display());
+        }
+        for topic in &self.misnamed {
+            tracing::warn!("{}: `{topic}` is left out: {NO_NAME}", path.display());
         }
         if let Some(first) = &self.first_unreadable {
             tracing::warn!(
@@ -87,7 +97,7 @@ pub fn for_each(
         .for_each(|entry| handle(lacks, entry).map_err(|error| Handled(error.into())));
     match report {
         Ok(report) => {
-            lacks.damage = report.damage;
+            (lacks.damage, lacks.misnamed) = (report.damage, report.misnamed);
             Ok(())
         }
         Err(ReadFailure::Recording(error)) => Err(error.into()),

@@ -59,6 +59,9 @@ pub struct RecordingInfo {
     pub newer: u64,
     /// Number of messages on topics that are not Crossfix's.
     pub foreign: u64,
+    /// Topics that begin as Crossfix's do but are none, as a name in them is not possible.
+    #[serde(skip_serializing_if = "BTreeSet::is_empty")]
+    pub misnamed: BTreeSet<String>,
     /// Who wrote it, if the file states it.
     pub source: Option<Source>,
     /// The last health report of each component, by its name: counters and problems.
@@ -116,6 +119,7 @@ impl RecordingInfo {
                 cameras: messages.cameras,
                 newer: messages.newer,
                 foreign: report.foreign,
+                misnamed: report.misnamed,
                 source: report.source,
                 health: messages.health,
                 damage: report.damage,

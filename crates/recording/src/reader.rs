@@ -1,4 +1,4 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -24,6 +24,9 @@ pub struct ReadReport {
     pub messages: u64,
     /// Number of messages on topics that are not Crossfix's; they were left out.
     pub foreign: u64,
+    /// Topics that begin as Crossfix's do but are none, as a name in them is not possible; their
+    /// messages are among the foreign ones.
+    pub misnamed: BTreeSet<String>,
     /// Who wrote it, if the file states it.
     pub source: Option<Source>,
     /// What could not be read; everything else was handed on.
@@ -272,14 +275,26 @@ impl<R: Read + Seek> RecordingReader<R> {
     }
 
     fn learn(&mut self, (id, topic): &(u16, String)) {
-        self.keys.insert(*id, topic.parse().ok());
+        let key = self.key(topic);
+        self.keys.insert(*id, key);
+    }
+
+    fn key(&mut self, topic: &str) -> Option<Key> {
+        let key = topic.parse().ok();
+        if key.is_none() && topic.starts_with("crossfix/") {
+            self.report.misnamed.insert(topic.to_owned());
+        }
+        key
     }
 
     fn learn_texts(&mut self, texts: &Texts) {
         if texts.name == CHANNELS {
             for (id, topic) in &texts.pairs {
-                if let Ok(id) = id.parse() {
-                    self.keys.entry(id).or_insert_with(|| topic.parse().ok());
+                if let Ok(id) = id.parse()
+                    && !self.keys.contains_key(&id)
+                {
+                    let key = self.key(topic);
+                    self.keys.insert(id, key);
                 }
             }
         }

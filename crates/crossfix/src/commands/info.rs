@@ -5,6 +5,7 @@ use crossfix_recording::{RecordingInfo, Source};
 
 use crate::commands::examples;
 use crate::output;
+use crate::recorded::NO_NAME;
 
 /// Say what a recording holds: channels, messages, times; and what it lacks: losses, damage.
 #[derive(Debug, clap::Args)]
@@ -52,7 +53,10 @@ fn print(info: &RecordingInfo) {
     }));
     output::line(output::table(&rows));
     if info.foreign > 0 {
-        output::line(format!("{} messages in other schemas, such as Foxglove's", info.foreign));
+        output::line(format!("{} messages are not Crossfix's, as Foxglove's", info.foreign));
+    }
+    for topic in &info.misnamed {
+        output::line(format!("among them `{topic}`: {NO_NAME}"));
     }
     if info.newer > 0 {
         output::line(format!("{} messages are of a newer version: update this side", info.newer));

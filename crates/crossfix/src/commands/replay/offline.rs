@@ -149,7 +149,13 @@ impl OfflineFusion {
             Channel::Bearings(_) => self.frames += 1,
             _ => {}
         }
-        self.site.get_or_insert_with(|| entry.key.site.clone());
+        let site = self.site.get_or_insert_with(|| entry.key.site.clone());
+        ensure!(
+            *site == entry.key.site,
+            "the recording is of two sites, `{site}` and `{}`: their targets and clocks have nothing \
+             in common",
+            entry.key.site
+        );
         self.writer.write(entry)?;
         let start = Instant::now();
         let outputs = self.centre.take(&entry.key.channel, &entry.data, "");
