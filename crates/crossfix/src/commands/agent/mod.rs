@@ -38,6 +38,7 @@ use crate::service;
 use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 
 #[cfg(feature = "centre")]
+pub use self::report::CALIBRATION_PERIOD;
 pub use self::simulated::truth_frame;
 
 /// An agent this far behind its source is too slow for it: the fusion centre waits half a second

@@ -10,7 +10,7 @@ use crate::{health, service};
 
 /// How often the calibration is published again, for receivers that joined late. With twice as much
 /// the bearings of a camera are of no use to such a receiver for up to four seconds.
-const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
+pub const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
 
 impl Agent {
     /// Publishes calibration and health again when they are due.

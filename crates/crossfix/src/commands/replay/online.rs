@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::ensure;
 use crossfix_message::{
@@ -13,7 +13,8 @@ use crossfix_message::{
 use crossfix_recording::Entry;
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
 
-use super::{Args, Contents, TimeRange};
+use super::{Args, Contents, TimeRange, calibrations};
+use crate::commands::agent::CALIBRATION_PERIOD;
 use crate::config;
 use crate::network;
 use crate::output;
@@ -58,10 +59,23 @@ pub fn publish(
     ensure_heard(&args.recording, contents, &network)?;
     tracing::info!("publishing as the cameras of `{}` in {RUN_UP_S} s", link.site());
     let delivery = if args.speed > 0.0 { Delivery::Queued } else { Delivery::Every };
-    let mut stage =
-        Stage { link, delivery, publishers: BTreeMap::new(), alive: Vec::new(), published: 0 };
+    let mut stage = Stage {
+        link,
+        delivery,
+        publishers: BTreeMap::new(),
+        alive: Vec::new(),
+        published: 0,
+        calibrations: BTreeMap::new(),
+        calibrated: Instant::now(),
+    };
     let mut left_out = LeftOut::default();
     stage.appear(&network, args.tracks)?;
+    if !range.is_whole {
+        let valid = calibrations(&args.recording, range)?.into_iter();
+        for entry in valid.filter(|entry| left_out.admits(entry, &network)) {
+            stage.send(entry)?;
+        }
+    }
     let mut pass = Pass { goes_on: args.again, ..Pass::default() };
     // The run-up takes the same time at any speed.
     if Pace::beginning_in(RUN_UP_S, 1.0).wait(0.0, &shutdown) {
@@ -77,6 +91,7 @@ pub fn publish(
                 let since_s = entry.data_time.seconds_since(range.from) + pass.by_s;
                 if pace.wait(since_s, &shutdown) {
                     stage.put(pass.shifted(entry))?;
+                    stage.repeat_calibrations()?;
                 }
                 Ok(())
             })?;
@@ -177,6 +192,9 @@ struct Stage {
     /// Tokens of presence for the components that the replay stands in for.
     alive: Vec<AliveToken>,
     published: u64,
+    /// The newest calibration of each camera, and when they were last published.
+    calibrations: BTreeMap<Key, Entry>,
+    calibrated: Instant,
 }
 
 impl Stage {
@@ -190,7 +208,28 @@ impl Stage {
         Ok(())
     }
 
+    /// Publishes the calibrations again, as agents do: who begins to listen later needs them.
+    fn repeat_calibrations(&mut self) -> anyhow::Result<()> {
+        if self.calibrated.elapsed() < CALIBRATION_PERIOD {
+            return Ok(());
+        }
+        self.calibrated = Instant::now();
+        for entry in self.calibrations.values().cloned().collect::<Vec<_>>() {
+            self.send(entry)?;
+        }
+        Ok(())
+    }
+
     fn put(&mut self, entry: Entry) -> anyhow::Result<()> {
+        self.send(entry)?;
+        self.published += 1;
+        Ok(())
+    }
+
+    fn send(&mut self, entry: Entry) -> anyhow::Result<()> {
+        if matches!(entry.key.channel, Channel::Calibration(_)) {
+            self.calibrations.insert(entry.key.clone(), entry.clone());
+        }
         let Key { area, channel, .. } = &entry.key;
         if !self.publishers.contains_key(&entry.key) {
             let is_picture = matches!(channel, Channel::Preview(_));
@@ -200,7 +239,6 @@ impl Stage {
         }
         if let Some(publisher) = self.publishers.get(&entry.key) {
             publisher.put(entry.data)?;
-            self.published += 1;
         }
         Ok(())
     }
