@@ -14,7 +14,7 @@ use super::selection::{PeriodLine, ScoredLines, Selection};
 use super::{NamedLine, NewTrack, lines_of};
 use crate::cameras::Rooted;
 use crate::cameras::{Cameras, KnownCamera};
-use crate::evidence::BEYOND_DOUBT;
+use crate::evidence::{BEYOND_DOUBT, ONE_IN_A_HUNDRED};
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
 use crate::track::{FusedTrack, StartLine, TrackBearing, TrackExpectation, TrackId, TrackStatus};
@@ -62,6 +62,8 @@ struct Hypothesis {
     born: Timestamp,
     /// The test against its lines being of several targets, one per camera.
     one_target: OneTargetTest,
+    /// See [`Seed::is_disputed`].
+    is_disputed: bool,
 }
 
 /// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
@@ -118,7 +120,8 @@ impl Hypothesis {
     /// where the hypothesis has such a line, but not for two cameras, of which one line at least
     /// does not stand: a target that flies slowly passes for standing before one of them, and would
     /// be found ten seconds later. If none of its lines has been seen to come or to move, all may
-    /// stand, and it needs as much more as against any other rival.
+    /// stand, and it needs as much more as against any other rival. If it is disputed, a third
+    /// camera does not see a target that it should see.
     fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
         let cameras = self.cameras();
         let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
@@ -130,7 +133,13 @@ impl Hypothesis {
         });
         let choices: f64 = choices.sum();
         let moves = cameras.iter().any(|camera| rooted(camera) == Rooted::No);
-        if moves { choices } else { choices + BEYOND_DOUBT }
+        if !moves {
+            choices + BEYOND_DOUBT
+        } else if self.is_disputed && cameras.len() == 2 {
+            choices - ONE_IN_A_HUNDRED
+        } else {
+            choices
+        }
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {
@@ -205,12 +214,21 @@ impl Hypotheses {
         self.hypotheses.retain(|h| {
             h.cameras().len() >= 2 && h.one_target.log_ratio().is_none_or(|r| r > LEAST_SCORE)
         });
-        let seeds = self.finder.find(exposures, cameras);
+        let held = self.held();
+        // In the first period nothing has been followed before.
+        let is_first = self.period == 1;
+        let seeds = self.finder.find(exposures, cameras, |id| is_first || held.contains(id));
         self.begin(seeds, exposures, motion);
         self.prune();
         let now = exposures.last().map(|exposure| exposure.time);
         let lines = numbers_of_lines(exposures);
         now.map_or_else(Vec::new, |now| self.confirm(now, &lines, motion))
+    }
+
+    /// The lines of this period that continue hypotheses of three cameras.
+    fn held(&self) -> BTreeSet<LineId> {
+        let of_three = self.hypotheses.iter().filter(|h| h.cameras().len() >= 3);
+        of_three.flat_map(|h| h.newest(self.period)).cloned().collect()
     }
 
     /// Continues every hypothesis with each bearing in its gate, and without any.
@@ -374,6 +392,7 @@ impl Hypotheses {
                 periods: 1,
                 born: time,
                 one_target,
+                is_disputed: seed.is_disputed,
             });
         }
     }

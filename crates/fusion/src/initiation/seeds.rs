@@ -59,6 +59,9 @@ pub(crate) struct Seed {
     pub(crate) solution: MapSolution,
     /// Log-likelihood ratio of a new target against clutter.
     pub(crate) score: f64,
+    /// Whether it is of two cameras, whose lines are also part of sets of three in this period, which
+    /// do not continue any of before: the third camera sees something else.
+    pub(crate) is_disputed: bool,
 }
 
 impl Seed {
@@ -131,8 +134,14 @@ impl SeedFinder {
         }
     }
 
-    /// All seeds of one period, the likeliest first.
-    pub(crate) fn find(&self, exposures: &[&Exposure], cameras: &Cameras) -> Vec<Seed> {
+    /// All seeds of one period, the likeliest first. `is_held` tells of a line whether what has been
+    /// followed before explains it.
+    pub(crate) fn find(
+        &self,
+        exposures: &[&Exposure],
+        cameras: &Cameras,
+        is_held: impl Fn(&LineId) -> bool,
+    ) -> Vec<Seed> {
         let lines: Vec<Vec<NamedLine>> =
             exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
         let growing = Growing { exposures, cameras, lines: &lines };
@@ -169,28 +178,9 @@ impl SeedFinder {
                 }
             }
         }
-        self.best(seeds)
-    }
-
-    /// The likeliest seeds, each set once.
-    fn best(&self, seeds: Vec<Seed>) -> Vec<Seed> {
-        // If cameras report the same bearings many times, many seeds are alike: the names are made
-        // once.
-        let names: Vec<Vec<LineId>> = seeds.iter().map(ids).collect();
-        let mut order: Vec<usize> = (0..seeds.len()).collect();
-        order.sort_by(|&a, &b| {
-            seeds[b].score.total_cmp(&seeds[a].score).then_with(|| names[a].cmp(&names[b]))
-        });
-        let mut seen = BTreeSet::new();
-        order.retain(|&i| seen.insert(&names[i]));
-        // A pair whose two lines are both part of sets of three cameras, the same set or different
-        // ones, can wait for the next period: there are many more such pairs than targets.
-        let agreed: BTreeSet<&LineId> =
-            order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
-        order.retain(|&i| names[i].len() > 2 || !names[i].iter().all(|id| agreed.contains(id)));
-        order.truncate(BOUNDS.kept);
-        let mut seeds: Vec<Option<Seed>> = seeds.into_iter().map(Some).collect();
-        order.into_iter().filter_map(|i| seeds[i].take()).collect()
+        // Of three cameras two are more than the third; of more, three should agree.
+        let of_three = lines.iter().filter(|lines| !lines.is_empty()).count() <= 3;
+        best(seeds, |id| is_held(id) || !of_three)
     }
 
     /// Pairs of cameras within reach of each other that have lines, those whose optical axes cross
@@ -332,7 +322,7 @@ impl SeedFinder {
             set.iter().map(|at| growing.exposures[at.exposure].clutter_per_sr.ln()).sum();
         let score = self.log_evidence(&lines, &solution)? - false_alarms
             + silent as f64 * (1.0 - self.detection_probability).ln();
-        (score > self.least_score).then_some(Seed { lines, solution, score })
+        (score > self.least_score).then_some(Seed { lines, solution, score, is_disputed: false })
     }
 
     /// Number of cameras that should have seen a target at this position and have no line in the
@@ -384,6 +374,33 @@ fn is_rooted(growing: &Growing<'_>, set: &[LineIndex]) -> bool {
     let rooted = || set.iter().map(|&at| growing.rooted(at));
     rooted().all(|rooted| rooted == Rooted::Yes)
         || (set.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown))
+}
+
+/// The likeliest seeds, each set once.
+fn best(seeds: Vec<Seed>, is_held: impl Fn(&LineId) -> bool) -> Vec<Seed> {
+    // If cameras report the same bearings many times, many seeds are alike: the names are made
+    // once.
+    let names: Vec<Vec<LineId>> = seeds.iter().map(ids).collect();
+    let mut order: Vec<usize> = (0..seeds.len()).collect();
+    order.sort_by(|&a, &b| {
+        seeds[b].score.total_cmp(&seeds[a].score).then_with(|| names[a].cmp(&names[b]))
+    });
+    let mut seen = BTreeSet::new();
+    order.retain(|&i| seen.insert(&names[i]));
+    // A pair whose two lines are both part of sets of three cameras, the same set or different
+    // ones, can wait for the next period: there are many more such pairs than targets. But not if
+    // that next period has come and nothing continues these sets. Where one of three cameras is
+    // turned, a great speed explains its line in each period anew, and in no two.
+    let agreed: BTreeSet<&LineId> =
+        order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
+    let is_disputed =
+        |i: usize| names[i].len() == 2 && names[i].iter().all(|id| agreed.contains(id));
+    order.retain(|&i| !(is_disputed(i) && names[i].iter().all(&is_held)));
+    order.truncate(BOUNDS.kept);
+    let disputed: Vec<bool> = order.iter().map(|&i| is_disputed(i)).collect();
+    let mut seeds: Vec<Option<Seed>> = seeds.into_iter().map(Some).collect();
+    let kept = order.into_iter().zip(disputed);
+    kept.filter_map(|(i, is_disputed)| Some(Seed { is_disputed, ..seeds[i].take()? })).collect()
 }
 
 fn optical_axis(pose: &Pose) -> Vector3<f64> {
