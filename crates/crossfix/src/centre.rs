@@ -140,6 +140,10 @@ impl Centre {
                 .warn("nothing found", Instant::now(), || format!("nothing is found: {why}"));
         }
         if self.poses.check(&self.fusion) {
+            for camera in self.alone() {
+                let problem = || problem_of_one_alone(&camera);
+                self.repeats.warn(&format!("alone {camera}"), Instant::now(), problem);
+            }
             for (camera, problem) in self.poses.problems() {
                 self.repeats.warn(&format!("moved {camera}"), Instant::now(), || problem);
             }
@@ -270,6 +274,13 @@ impl Centre {
         left_out.map(|report| report.camera).collect()
     }
 
+    /// The cameras of whose bearings none is of the targets that others see in their view.
+    fn alone(&self) -> Vec<CameraName> {
+        let reports = self.fusion.cameras();
+        let alone = reports.filter(|it| it.is_alone && it.standing != Standing::Excluded);
+        alone.map(|report| report.camera).collect()
+    }
+
     /// Logs the counts of repeated warnings that are due.
     pub fn remind(&mut self, now: Instant) {
         self.repeats.remind(now);
@@ -314,6 +325,7 @@ impl Centre {
         let left_out = self.left_out();
         let left_out = left_out.iter().map(|camera| format!("camera `{camera}` is left out"));
         let moved = self.poses.problems().map(|(_, problem)| problem);
+        let alone = self.alone().into_iter().map(|camera| problem_of_one_alone(&camera));
         let nothing = self.why_nothing().map(|why| format!("nothing is found: {why}"));
         Health {
             component: "fusion".to_owned(),
@@ -321,12 +333,19 @@ impl Centre {
             handled: self.frames,
             counters,
             cameras: self.fusion.cameras().map(|report| camera_health(&report)).collect(),
-            problems: left_out.chain(moved).chain(nothing).collect(),
+            problems: left_out.chain(moved).chain(alone).chain(nothing).collect(),
             scene_begins_ns: self.scene_begins.nanos(),
             tracks: self.fusion.tracks().count().try_into().unwrap_or(u32::MAX),
             ..Default::default()
         }
     }
+}
+
+fn problem_of_one_alone(camera: &CameraName) -> String {
+    format!(
+        "camera `{camera}` sees something, but none of the targets that others see in its view: \
+         check its pose and its clock, and what stands before it"
+    )
 }
 
 /// A camera's report as a wire message.

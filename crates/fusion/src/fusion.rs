@@ -62,6 +62,8 @@ pub struct CameraReport {
     pub camera: CameraName,
     /// How far its bearings are believed.
     pub standing: Standing,
+    /// Whether it sees something, but none of the targets that two others see in its view.
+    pub is_alone: bool,
     /// Factor by which its reported covariances are multiplied.
     pub noise_factor: f64,
     /// Its clock; `None` until the camera has been heard.
@@ -232,6 +234,7 @@ impl Fusion {
         self.cameras.iter().map(|(name, camera)| CameraReport {
             camera: name.clone(),
             standing: camera.standing(),
+            is_alone: camera.is_alone(),
             noise_factor: camera.noise_factor(),
             clock: self.clocks.estimate(name).map(|clock| ClockEstimate {
                 offset_s: clock.offset_s + self.site_time.ahead_s(name),
@@ -386,6 +389,9 @@ impl Fusion {
             let holding_s = tracker.motion().holding_s;
             let differences = &step.third_differences;
             camera.learn_noise(exposure.time, differences, step.unassigned, holding_s);
+            if let Some(company) = step.company {
+                camera.learn_company(exposure.time, company);
+            }
         }
         (step.fittings, step.used)
     }

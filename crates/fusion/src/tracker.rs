@@ -9,7 +9,9 @@ use std::collections::BTreeMap;
 use crossfix_filter::{Gate, KinematicState};
 use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 
-use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, ScaleSample, ThirdDifferences};
+use crate::cameras::{
+    Cameras, ClockChange, Fitting, Fittings, KnownCamera, Rooted, ScaleSample, ThirdDifferences,
+};
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::reacquisition::{Reacquisition, ReacquisitionContext};
@@ -89,6 +91,9 @@ pub(crate) struct TrackerStep {
     pub(crate) third_differences: Vec<ThirdDifferences>,
     /// Number of its sightings that no track has taken.
     pub(crate) unassigned: usize,
+    /// Whether the exposure shows any of the targets that two other cameras see in this one's view;
+    /// `None` if there are none.
+    pub(crate) company: Option<Fitting>,
     pub(crate) changes: Vec<TrackChange>,
 }
 
@@ -281,6 +286,7 @@ impl Tracker {
             .filter_map(|(index, owner)| Some(UsedSighting { index, track: (*owner)? }))
             .collect();
         let unassigned = owners.iter().filter(|owner| owner.is_none()).count();
+        let company = self.company(exposure, known, &owners);
         let (mut free, mut provisional) = (Vec::new(), Vec::new());
         for (sighting, owner) in exposure.sightings.iter().zip(owners) {
             // Bearings of tracks that one camera alone follows are offered to the initiation as
@@ -295,7 +301,36 @@ impl Tracker {
         changes.extend(self.review(exposure.time));
         changes.extend(self.merge(exposure.time));
         changes.extend(self.prove(exposure.time, cameras));
-        TrackerStep { free, provisional, used, fittings, third_differences, unassigned, changes }
+        TrackerStep {
+            free,
+            provisional,
+            used,
+            fittings,
+            third_differences,
+            unassigned,
+            company,
+            changes,
+        }
+    }
+
+    /// Whether an exposure, whose bearings have these owners, shows any of the targets that two
+    /// other cameras see in this one's view, or something that moves and is none of them. Where it
+    /// shows nothing that moves, something may hide them.
+    fn company(
+        &self,
+        exposure: &Exposure,
+        known: &KnownCamera,
+        owners: &[Option<TrackId>],
+    ) -> Option<Fitting> {
+        let mut expected = self.tracks.values().filter(|track| {
+            track.is_confirmed()
+                && track.others_than(&exposure.camera, &self.motion) >= 2
+                && known.expects(track.position_at(exposure.time), self.max_range_m)
+        });
+        expected.next()?;
+        let mut others = exposure.sightings.iter().filter(|seen| seen.rooted != Rooted::Yes);
+        let is_alone = owners.iter().all(Option::is_none) && others.next().is_some();
+        Some(if is_alone { Fitting::Beside } else { Fitting::Fits })
     }
 
     /// The cameras' mean offsets from confirmed targets, by target, for those whose comparison is

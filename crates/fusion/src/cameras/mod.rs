@@ -103,6 +103,8 @@ pub(crate) struct CameraState {
     misfits: StandingRecord,
     /// By the times of its frames.
     punctuality: StandingRecord,
+    /// By whether what it sees is any of the targets that two others see in its view.
+    company: StandingRecord,
 }
 
 impl CameraState {
@@ -119,6 +121,7 @@ impl CameraState {
             standing: StandingRecord::default(),
             misfits: StandingRecord::default(),
             punctuality: StandingRecord::default(),
+            company: StandingRecord::default(),
         }
     }
 
@@ -154,11 +157,28 @@ impl CameraState {
     pub(crate) fn standing(&self) -> Standing {
         if self.is_excluded() {
             Standing::Excluded
-        } else if self.pose_scale.is_doubted() || self.noise_factor() > DOUBTED_NOISE {
+        } else if self.pose_scale.is_doubted()
+            || self.noise_factor() > DOUBTED_NOISE
+            || self.is_alone()
+        {
             Standing::Doubted
         } else {
             Standing::Good
         }
+    }
+
+    /// Whether it sees something, but none of the targets that two others see in its view. Pose or
+    /// clock of one of the three may be wrong, or something may hide the targets: nobody is
+    /// accused, but it is said.
+    pub(crate) fn is_alone(&self) -> bool {
+        self.company.is_excluded()
+    }
+
+    /// Takes in whether an exposure shows any of the targets that two others see in the camera's
+    /// view, or other things alone.
+    pub(crate) fn learn_company(&mut self, time: Timestamp, company: Fitting) {
+        self.company.learn(time, &[company]);
+        self.company.review();
     }
 
     /// Whether the camera is left out.
@@ -240,6 +260,7 @@ impl CameraState {
         self.noise = BearingNoise::default();
         self.view = self.view.emptied();
         self.told_clock = None;
+        self.company = StandingRecord::default();
     }
 }
 
