@@ -2,7 +2,7 @@
 //! several unsynchronised cameras, with RTK truth, and poses and clocks fitted
 //! to a calibration part.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
@@ -210,7 +210,9 @@ pub fn read(dir: &Path, selection: &LabelSelection<'_>) -> anyhow::Result<Import
     let rtk = rtk_samples(&folder.join("trajectory").join("rtk.txt"))?;
     let log = rtk.iter().copied().filter(|sample| is_wanted(sample.time_s)).collect();
     let mut entries = truth(&rtk, &masked, &site, is_wanted);
+    let mut seen = BTreeSet::new();
     for wanted in selection.cameras {
+        ensure!(seen.insert(wanted), "camera `{wanted}` is named twice");
         let found = split.cameras.iter().find(|(_, camera)| camera.name == *wanted);
         let Some((key, fitted)) = found else {
             let known: Vec<&str> = split.cameras.values().map(|c| c.name.as_str()).collect();

@@ -21,6 +21,10 @@ const CALIBRATION: &str = "calibration.toml";
 /// a turn of some milliradians is not certain. With half of it a camera that is turned by more than
 /// that might be said to fit.
 const LEAST_WATCHED_S: f64 = 20.0;
+/// A camera of which no more is known than that it is not turned by this counts as not checked,
+/// rad: it is next to what is assumed before anything flies. With half of it cameras are said to be
+/// unchecked that are known to a degree.
+const UNKNOWN_TURN_RAD: f64 = 0.02;
 
 /// Whether cameras still stand as they were calibrated: by where the others see the targets.
 ///
@@ -255,6 +259,9 @@ impl WatchedCamera {
                  is wrong"
                     .to_owned(),
             ),
+            Some(watch) if watch.worst.turn_sd >= UNKNOWN_TURN_RAD => {
+                (CameraVerdict::Unchecked, "what flew tells nothing of how it is turned".to_owned())
+            }
             Some(watch) if watch.watched_s >= LEAST_WATCHED_S => (
                 CameraVerdict::Fits,
                 watch.moved_at.map_or_else(String::new, |at| {
