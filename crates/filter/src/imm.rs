@@ -1,4 +1,4 @@
-use nalgebra::{Matrix6, Unit, Vector3, Vector6};
+use nalgebra::{Matrix6, Vector6};
 
 use crate::KinematicState;
 use crate::models::{MAX_MODELS, ModelWeights, MotionModels, Restlessness};
@@ -155,40 +155,6 @@ impl Imm {
             self.restlessness.see(models.calm_probability(self.probabilities()), interval);
         }
         Some(largest + sum.ln())
-    }
-
-    /// Accounts for an axis `along` which the target was not observed during the last `interval`
-    /// seconds: its motion may have followed the models of `since` in place of those of `before`,
-    /// and no measurement would have shown it.
-    pub fn widen_along(
-        &mut self,
-        interval: f64,
-        along: &Unit<Vector3<f64>>,
-        before: &MotionModels,
-        since: &MotionModels,
-    ) {
-        let transitions = since.transitions(interval, &self.restlessness);
-        let states: Vec<KinematicState> =
-            (0..self.states.len()).map(|j| self.mixed(j, &transitions)).collect();
-        self.probabilities = self.probabilities_after(&transitions);
-        self.calm_most = Some(since.calm_probability(self.probabilities()));
-        self.states = states;
-        let axis = along.into_inner() * along.transpose();
-        for ((state, old), new) in self.states.iter_mut().zip(before.models()).zip(since.models()) {
-            // White acceleration of density q over T: Q = q [T^3/3 T^2/2; T^2/2 T], here along one
-            // axis (a a') and for the density by which the livelier model exceeds the old one.
-            let more = axis * (new.density - old.density).max(0.0);
-            for (row, column, share) in [
-                (0, 0, interval.powi(3) / 3.0),
-                (0, 3, interval.powi(2) / 2.0),
-                (3, 0, interval.powi(2) / 2.0),
-                (3, 3, interval),
-            ] {
-                let mut block = state.covariance.fixed_view_mut::<3, 3>(row, column);
-                block += more * share;
-            }
-        }
-        self.combined = combined(&self.states, &self.probabilities);
     }
 
     /// Widens every model's covariance to at least these standard deviations and drops the

@@ -1,9 +1,11 @@
 //! The fusion centre as a state machine: bearing frames in, track frames, events and cues out.
 //!
-//! The way of a frame, in the order of the calls: read into an exposure (`ingress.rs`), its clock
-//! corrected (`clocks/`, `fusion/correcting.rs`), put in order (`event_time.rs`), its bearings
-//! given to the tracks that they fit (`tracker/`), the rest to new ones (`initiation/`); what the
-//! exposure shows of its camera (`cameras/`), and what is said of it all (`fusion/saying.rs`).
+//! The way of a frame, in the order of the calls: steps of its clock are taken off
+//! (`site_time.rs`); it is read into an exposure (`ingress.rs`), put in order by the time that it
+//! reports (`event_time.rs`), and once more by that less its clock's offset (`clocks/`,
+//! `fusion/correcting.rs`); its bearings go to the tracks that they fit (`tracker/`), the rest to
+//! new ones (`initiation/`); what the exposure shows of its camera is learnt (`cameras/`), and what
+//! has changed is said (`fusion/saying.rs`).
 //!
 //! It has no clock, thread or file, so that a recording gives the tracks of the live run, bit for
 //! bit.

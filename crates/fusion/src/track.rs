@@ -430,30 +430,11 @@ impl FusedTrack {
         }
         let lately = |ties: &&Ties| ties.has_seen_lately(time, motion.holding_s);
         self.triangulated = self.ties.values().filter(lately).count() >= 2;
-        self.range_again(line, motion);
+        let sees = |ties: &&Ties| ties.sees(time, motion.holding_s);
+        self.ranged = self.ties.values().filter(sees).count() >= 2;
         self.gather(&bearing, &innovation);
         let third_differences = self.third_differences(camera, line, motion);
         Some(Taken { manoeuvre, third_differences })
-    }
-
-    /// Checks whether two cameras still see the target. When that ends, one camera alone has been
-    /// seeing it for some time already, and the target may have moved along that camera's sight
-    /// line unseen: this motion is added for the time since.
-    fn range_again(&mut self, line: &SightLine, motion: &MotionSetup) {
-        let sees = |ties: &&Ties| ties.sees(self.updated_at, motion.holding_s);
-        // Only the step from two cameras to one adds motion; later bearings find `ranged` false
-        // already.
-        let is_ranged = self.ties.values().filter(sees).count() >= 2;
-        if std::mem::replace(&mut self.ranged, is_ranged) && !is_ranged {
-            let silent = self.ties.values().filter_map(|ties| ties.silent_s(self.updated_at));
-            // The camera of this bearing is silent for 0 s; the shortest silence of the others is
-            // the time to make up for.
-            let silent_s = silent.filter(|silent_s| *silent_s > 0.0).fold(f64::INFINITY, f64::min);
-            if silent_s.is_finite() {
-                let (before, since) = (motion.models(true), motion.models(false));
-                self.imm.widen_along(silent_s, &line.direction, before, since);
-            }
-        }
     }
 
     /// Whether two cameras have lately supported the track, within 1.5 s or so. With only one since
