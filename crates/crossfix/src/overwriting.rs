@@ -2,9 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use anyhow::bail;
 use clap::{ArgMatches, Command};
-
-use crate::output::Misuse;
 
 /// The arguments that name files to write.
 const WRITTEN: [&str; 12] = [
@@ -39,18 +38,18 @@ impl NamedPath {
 
 /// Refuses a command line on which a file that exists is to be read and written, or one file to be
 /// written twice. Pipes and devices may be.
-pub fn check(command: &Command, matches: &ArgMatches) -> Result<(), Misuse> {
+pub fn check(command: &Command, matches: &ArgMatches) -> anyhow::Result<()> {
     let paths = paths(command, matches);
     let (written, read): (Vec<_>, Vec<_>) = paths.into_iter().partition(NamedPath::is_written);
     let is_ordinary = |path: &Path| path.is_file() || !path.exists();
     for (index, NamedPath { path, .. }) in written.iter().enumerate() {
         let shown = path.display();
         if path.is_file() && read.iter().any(|other| other.is_read_from(path)) {
-            return Err(Misuse(format!("{shown} is what is read: write to another file")));
+            bail!("{shown} is what is read: write to another file");
         }
         let earlier = written[..index].iter();
         if is_ordinary(path) && earlier.clone().any(|other| is_one_file(&other.path, path)) {
-            return Err(Misuse(format!("{shown} is to be written twice: name two files")));
+            bail!("{shown} is to be written twice: name two files");
         }
     }
     Ok(())
@@ -90,7 +89,7 @@ mod tests {
     fn refused(line: &[&str]) -> Option<String> {
         let command = crate::Cli::command();
         let matches = command.clone().try_get_matches_from(line).unwrap();
-        check(&command, &matches).err().map(|misuse| misuse.to_string())
+        check(&command, &matches).err().map(|error| error.to_string())
     }
 
     #[test]
