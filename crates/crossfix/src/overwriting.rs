@@ -10,9 +10,13 @@ const WRITTEN: [&str; 12] = [
     "output", "csv", "save", "geojson", "kml", "cot", "sapient", "asterix", "foxglove", "log_out",
     "picture", "json",
 ];
-/// The arguments that name folders of which the files with these endings are read.
-const FOLDERS: [&str; 2] = ["dir", "site"];
-const READ_IN_FOLDERS: [&str; 5] = ["csv", "json", "toml", "yaml", "yml"];
+/// What is read of a folder that the argument `dir` names: the files of data sets.
+const OF_DATA_SETS: [&str; 5] =
+    ["scenario.json", "exposures.csv", "detections.csv", "truth.csv", "poses.json"];
+/// How the files end that are read of a folder that the argument `site` names, ...
+const OF_SITES: [&str; 3] = ["toml", "yaml", "yml"];
+/// ... but for the one that `calibrate` completes camera by camera.
+const COMPLETED: &str = "calibration.toml";
 
 /// A path on the command line.
 struct NamedPath {
@@ -27,12 +31,15 @@ impl NamedPath {
 
     /// Whether this is a file that is read, of which `written` would be the end.
     fn is_read_from(&self, written: &Path) -> bool {
-        let is_folder = FOLDERS.contains(&self.argument.as_str()) && self.path.is_dir();
-        let ending = written.extension().and_then(|ending| ending.to_str());
-        if is_folder && ending.is_some_and(|ending| READ_IN_FOLDERS.contains(&ending)) {
-            return is_one_file(written.parent().unwrap_or(Path::new("")), &self.path);
-        }
-        is_one_file(written, &self.path)
+        let name = written.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let ending = written.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
+        let is_in_it = match self.argument.as_str() {
+            "dir" => OF_DATA_SETS.contains(&name),
+            "site" => OF_SITES.contains(&ending) && name != COMPLETED,
+            _ => false,
+        };
+        let folder = written.parent().unwrap_or(Path::new(""));
+        is_one_file(written, &self.path) || is_in_it && is_one_file(folder, &self.path)
     }
 }
 
@@ -130,5 +137,24 @@ mod tests {
         };
         assert!(line(&path("detections.csv")).is_some());
         assert_eq!(line(&path("before.mcap")), None);
+    }
+
+    #[cfg(feature = "centre")]
+    #[test]
+    fn a_sites_calibration_is_completed_camera_by_camera() {
+        let folder = tempfile::tempdir().unwrap();
+        let site = folder.path().to_str().unwrap();
+        let file = |name: &str| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, "dear").unwrap();
+            path.to_str().unwrap().to_owned()
+        };
+        let points = file("points.csv");
+        let line = |output: &str| {
+            let calibrate = ["crossfix", "calibrate", "landmarks", site, "--camera", "north"];
+            refused(&[&calibrate[..], &["--landmarks", &points, "-o", output]].concat())
+        };
+        assert_eq!(line(&file("calibration.toml")), None);
+        assert!(line(&file("north.toml")).is_some());
     }
 }

@@ -36,11 +36,21 @@ pub struct CameraWatch {
     pub moved_at: Option<Timestamp>,
     /// The longest time that the camera was watched within the fusion's memory, s.
     pub watched_s: f64,
+    /// The least standard deviation with which its turn was known, rad.
+    pub least_turn_sd: f64,
 }
 
 impl CameraWatch {
     fn new(found: PoseFinding, time: Timestamp) -> Self {
-        Self { now: None, worst: found, worst_at: time, moved_at: None, watched_s: 0.0 }
+        let least_turn_sd = found.turn_sd;
+        Self {
+            now: None,
+            worst: found,
+            worst_at: time,
+            moved_at: None,
+            watched_s: 0.0,
+            least_turn_sd,
+        }
     }
 
     fn take(&mut self, found: PoseFinding, time: Timestamp) {
@@ -51,6 +61,7 @@ impl CameraWatch {
             (self.worst, self.worst_at) = (found.clone(), time);
         }
         self.watched_s = self.watched_s.max(found.watched_s);
+        self.least_turn_sd = self.least_turn_sd.min(found.turn_sd);
         self.now = Some(found);
     }
 

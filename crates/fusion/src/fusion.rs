@@ -391,9 +391,7 @@ impl Fusion {
             let holding_s = tracker.motion().holding_s;
             let differences = &step.third_differences;
             camera.learn_noise(exposure.time, differences, step.unassigned, holding_s);
-            if let Some(company) = step.company {
-                camera.learn_company(exposure.time, company);
-            }
+            camera.learn_company(exposure.time, step.company);
         }
         (step.fittings, step.used)
     }

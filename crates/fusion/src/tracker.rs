@@ -328,7 +328,8 @@ impl Tracker {
                 && known.expects(track.position_at(exposure.time), self.max_range_m)
         });
         expected.next()?;
-        let mut others = exposure.sightings.iter().filter(|seen| seen.rooted != Rooted::Yes);
+        // What was there when the camera began to look, or since its mount turned, may stand there.
+        let mut others = exposure.sightings.iter().filter(|seen| seen.rooted == Rooted::No);
         let is_alone = owners.iter().all(Option::is_none) && others.next().is_some();
         Some(if is_alone { Fitting::Beside } else { Fitting::Fits })
     }

@@ -308,6 +308,7 @@ impl Unmet {
         let seen = self.seen.entry(exposure.camera.clone()).or_insert_with(nothing);
         seen.followed.retain(|_, followed| now.seconds_since(followed.last) <= SOMETHING_S);
         let mut lines = Vec::new();
+        let moving = exposure.sightings.iter().filter(|seen| seen.rooted != Rooted::Yes).count();
         for (Sighting { image_track, rooted, .. }, (_, timed)) in
             exposure.sightings.iter().zip(lines_with_pose(exposure))
         {
@@ -322,9 +323,8 @@ impl Unmet {
             seen.follows |= is_followed;
             // Software that numbers the bearings of each image anew follows nothing. Where image
             // after image shows one or two, they are of something: clutter is more, or is missing.
-            let is_all = !seen.follows
-                && now.seconds_since(seen.first) >= 2.0 * SOMETHING_S
-                && exposure.sightings.len() <= 2;
+            let is_all =
+                !seen.follows && now.seconds_since(seen.first) >= 2.0 * SOMETHING_S && moving <= 2;
             if (is_followed || is_all) && lines.len() < BOUNDS.lines {
                 lines.push(timed);
             }

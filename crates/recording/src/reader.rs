@@ -3,7 +3,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use crossfix_message::{Key, Timestamp};
+use crossfix_message::{Key, KeyError, Timestamp};
 use mcap::MAGIC;
 use mcap::records::{Record, op};
 use thiserror::Error;
@@ -280,11 +280,11 @@ impl<R: Read + Seek> RecordingReader<R> {
     }
 
     fn key(&mut self, topic: &str) -> Option<Key> {
-        let key = topic.parse().ok();
-        if key.is_none() && topic.starts_with("crossfix/") {
+        let key: Result<Key, KeyError> = topic.parse();
+        if let Err(KeyError::Name { .. }) = &key {
             self.report.misnamed.insert(topic.to_owned());
         }
-        key
+        key.ok()
     }
 
     fn learn_texts(&mut self, texts: &Texts) {

@@ -110,17 +110,18 @@ fn bearings(dir: &Path, site: &SiteName, cameras: &BTreeSet<u32>) -> anyhow::Res
             .with_context(|| format!("detections.csv, camera {}, scan {}", row.cam, row.scan))?;
         detections.entry((row.cam, row.scan)).or_default().push(row);
     }
-    let mut entries = Vec::new();
+    let (mut entries, mut seen) = (Vec::new(), BTreeSet::new());
     for row in read_csv::<ExposureRow>(&dir.join("exposures.csv"))? {
         let ExposureRow { t, cam, scan, n } = row;
         let own = detections.remove(&(cam, scan)).unwrap_or_default();
         let of = format!("exposures.csv, camera {cam}, scan {scan}");
         ensure!(cameras.contains(&cam), "{of}: scenario.json has no such camera");
         ensure!(t.is_finite(), "{of}: t is {t}");
+        ensure!(seen.insert((cam, scan)), "{of}: it is there twice");
         if let Some(n) = n {
             ensure!(n == own.len(), "{of}: n is {n}, and detections.csv has {} rows", own.len());
         }
-        let other = own.iter().filter_map(|row| row.t).find(|own| (own - t).abs() > same_s(t));
+        let other = own.iter().filter_map(|row| row.t).find(|own| (own - t).abs() > SAME_S);
         if let Some(other) = other {
             bail!("{of}: t is {t}, and {other} in detections.csv");
         }
@@ -132,10 +133,9 @@ fn bearings(dir: &Path, site: &SiteName, cameras: &BTreeSet<u32>) -> anyhow::Res
     Ok(entries)
 }
 
-/// Times that differ by less are the same, s: tables may hold nine digits.
-fn same_s(t: f64) -> f64 {
-    1e-6 + 1e-8 * t.abs()
-}
+/// Times that differ by less are the same, s: tables may hold six digits behind the point. With half
+/// of it the same.
+const SAME_S: f64 = 1e-5;
 
 fn ensure_possible(row: &DetectionRow) -> anyhow::Result<()> {
     let &DetectionRow { ux, uy, uz, sigma_rad, .. } = row;
@@ -143,7 +143,7 @@ fn ensure_possible(row: &DetectionRow) -> anyhow::Result<()> {
     ensure!((length - 1.0).abs() < 1e-3, "ux, uy, uz have the length {length}, and not 1");
     ensure!(
         sigma_rad > 0.0 && sigma_rad < 0.5,
-        "sigma_rad is {sigma_rad}: it must be from 0 to 0.5 rad"
+        "sigma_rad is {sigma_rad}: it must be above 0 and below 0.5 rad"
     );
     Ok(())
 }

@@ -157,10 +157,7 @@ impl CameraState {
     pub(crate) fn standing(&self) -> Standing {
         if self.is_excluded() {
             Standing::Excluded
-        } else if self.pose_scale.is_doubted()
-            || self.noise_factor() > DOUBTED_NOISE
-            || self.is_alone()
-        {
+        } else if self.pose_scale.is_doubted() || self.noise_factor() > DOUBTED_NOISE {
             Standing::Doubted
         } else {
             Standing::Good
@@ -175,9 +172,10 @@ impl CameraState {
     }
 
     /// Takes in whether an exposure shows any of the targets that two others see in the camera's
-    /// view, or other things alone.
-    pub(crate) fn learn_company(&mut self, time: Timestamp, company: Fitting) {
-        self.company.learn(time, &[company]);
+    /// view, or other things alone; `None` if there are no such targets.
+    pub(crate) fn learn_company(&mut self, time: Timestamp, company: Option<Fitting>) {
+        self.company.learn(time, company.as_slice());
+        self.company.lapse(time);
         self.company.review();
     }
 
@@ -400,11 +398,12 @@ impl Cameras {
         Assessment { standing, suspects_clock: misfits || excluded }
     }
 
-    /// Forgets the cameras' clutter rates, and what they have seen stand in their views and since
-    /// when: it is of another time.
+    /// Forgets the cameras' clutter rates, what they have seen stand in their views and since when,
+    /// and beside whom: it is of another time.
     pub(crate) fn forget_views(&mut self) {
         for camera in self.by_name.values_mut() {
             (camera.clutter, camera.view) = (ClutterRate::default(), camera.view.emptied());
+            camera.company = StandingRecord::default();
         }
     }
 }

@@ -215,7 +215,7 @@ impl Hypotheses {
             h.cameras().len() >= 2 && h.one_target.log_ratio().is_none_or(|r| r > LEAST_SCORE)
         });
         let held = self.held();
-        // In the first period nothing has been followed before.
+        // In the first period nothing can have been followed before.
         let is_first = self.period == 1;
         let seeds = self.finder.find(exposures, cameras, |id| is_first || held.contains(id));
         self.begin(seeds, exposures, motion);

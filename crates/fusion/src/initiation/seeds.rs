@@ -388,9 +388,9 @@ fn best(seeds: Vec<Seed>, is_held: impl Fn(&LineId) -> bool) -> Vec<Seed> {
     let mut seen = BTreeSet::new();
     order.retain(|&i| seen.insert(&names[i]));
     // A pair whose two lines are both part of sets of three cameras, the same set or different
-    // ones, can wait for the next period: there are many more such pairs than targets. But not if
-    // that next period has come and nothing continues these sets. Where one of three cameras is
-    // turned, a great speed explains its line in each period anew, and in no two.
+    // ones, can wait while what has been followed before holds these lines: there are many more
+    // such pairs than targets. If nothing holds them, the sets may be wrong: where one of three
+    // cameras is turned, a great speed explains its line in each period anew, and in no two.
     let agreed: BTreeSet<&LineId> =
         order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
     let is_disputed =

@@ -47,8 +47,8 @@ impl FusedTrack {
             if next.iter().all(|value| value.is_finite()) { next } else { Matrix6::zeros() };
     }
 
-    /// Computes the observability again if that was last done [`INFORMATION_S`] ago: until then most
-    /// of the information is the same, and the eigenvalues cost more than an update.
+    /// Computes the observability again if that was last done [`INFORMATION_S`] ago: until then more
+    /// than a third of the information is the same, and the eigenvalues cost more than an update.
     pub(crate) fn observe_again(&mut self) {
         if self.updated_at.seconds_since(self.observed) >= INFORMATION_S {
             self.observe();

@@ -259,7 +259,7 @@ impl WatchedCamera {
                  is wrong"
                     .to_owned(),
             ),
-            Some(watch) if watch.worst.turn_sd >= UNKNOWN_TURN_RAD => {
+            Some(watch) if watch.least_turn_sd >= UNKNOWN_TURN_RAD => {
                 (CameraVerdict::Unchecked, "what flew tells nothing of how it is turned".to_owned())
             }
             Some(watch) if watch.watched_s >= LEAST_WATCHED_S => (
