@@ -37,8 +37,8 @@ use crate::repeats::Repeats;
 use crate::service;
 use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 
-#[cfg(feature = "centre")]
 pub use self::report::CALIBRATION_PERIOD;
+#[cfg(feature = "centre")]
 pub use self::simulated::truth_frame;
 
 /// An agent this far behind its source is too slow for it: the fusion centre waits half a second
