@@ -137,13 +137,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             path.display()
         ));
     }
+    if counted.is_stopped {
+        tracing::warn!("stopped after {} frames: what is written ends there", counted.length);
+    }
     ensure!(
-        !counted.is_stopped,
-        "stopped after {} frames: what is written ends there",
-        counted.length
-    );
-    ensure!(
-        counted.with_target > 0,
+        counted.with_target > 0 || counted.is_stopped,
         "no target was found in the {} frames of {}",
         counted.tracked,
         args.video.display()
