@@ -59,7 +59,7 @@ pub(crate) struct Seed {
     pub(crate) solution: MapSolution,
     /// Log-likelihood ratio of a new target against clutter.
     pub(crate) score: f64,
-    /// Whether it is of two cameras, whose lines are also part of sets of three in this period, which
+    /// Whether it is of two cameras, whose lines are also part of sets of three in this period that
     /// do not continue any of before: the third camera sees something else.
     pub(crate) is_disputed: bool,
 }
@@ -134,8 +134,8 @@ impl SeedFinder {
         }
     }
 
-    /// All seeds of one period, the likeliest first. `is_held` tells of a line whether what has been
-    /// followed before explains it.
+    /// All seeds of one period, the likeliest first. `is_held` tells of a line whether something
+    /// that has been followed before goes on with it.
     pub(crate) fn find(
         &self,
         exposures: &[&Exposure],
