@@ -2,13 +2,13 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use crossfix_message::{
-    BearingFrame, BearingTrack, Channel, Health, ImageTrackState, Key, Payload, Vector3, Version,
-    decode,
+    BearingFrame, BearingTrack, CameraName, Channel, Health, ImageTrackState, Key, Payload,
+    Vector3, Version, decode,
 };
 use crossfix_recording::{Entry, RecordingWriter};
 use crossfix_tests::{PATIENCE, Site, crossfix, messages, now_seconds, succeed};
@@ -238,4 +238,21 @@ fn a_replay_counts_as_published_only_what_the_site_can_use() {
     let said = replayed("mixed.mcap");
     assert!(said.starts_with(&format!("{usable} messages published; left out: 2 of")), "{said}");
     assert!(said.contains(", 1 that cannot be read"), "{said}");
+}
+
+#[test]
+fn who_listens_to_a_replay_from_its_middle_hears_the_calibrations() {
+    let site = Site::new(8.0);
+    let (source, network) = (site.path("source.mcap"), site.path("network.toml"));
+    let replay = std::thread::spawn(move || succeed(&["replay", &source, "--network", &network]));
+    std::thread::sleep(Duration::from_secs(4));
+    let recorder = site.start_recorder("late.mcap");
+    replay.join().unwrap();
+    assert!(recorder.stop());
+    let cameras = |file: &str| -> BTreeSet<CameraName> {
+        let calibrations = |channel: &Channel| matches!(channel, Channel::Calibration(_));
+        let entries = messages(Path::new(&site.path(file)), calibrations);
+        entries.iter().filter_map(|entry| entry.key.channel.camera().cloned()).collect()
+    };
+    assert_eq!(cameras("late.mcap"), cameras("source.mcap"));
 }

@@ -12,7 +12,7 @@ const LATELY_S: f64 = 1.0;
 
 /// A statement holds for so long, s. Every track is stated at least each half second as long as
 /// there are data; later than this the data have ended, and nobody says where the target is. With
-/// half of it a site of one frame in five seconds has answers only half of the time.
+/// half of it a site whose frames come seven seconds apart has no answer in two of them.
 const HOLDS_S: f64 = 10.0;
 
 /// Record of a run's `TrackFrame`s: the causal answer to "where was each track at time t".

@@ -53,7 +53,7 @@ fn print(info: &RecordingInfo) {
     }));
     output::line(output::table(&rows));
     if info.foreign > 0 {
-        output::line(format!("{} messages are not Crossfix's, as Foxglove's", info.foreign));
+        output::line(format!("{} messages of others, such as Foxglove's", info.foreign));
     }
     for topic in &info.misnamed {
         output::line(format!("among them `{topic}`: {NO_NAME}"));

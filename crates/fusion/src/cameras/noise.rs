@@ -12,7 +12,7 @@ use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector2, Vector3};
 
-use crate::spatial::MEDIAN_OF_TWO;
+use crate::spatial::CHI_SQUARE_2_MEDIAN;
 use crate::uncertainty::CorrelatedNoise;
 
 /// Number of draws that the estimate remembers: it is then known to 13 %. With half as many a
@@ -143,8 +143,8 @@ impl RunningScale {
         // A step towards the median, up or down: half a draw over the number of draws and over the
         // slope, by which the share of draws below the median m grows with the scale's logarithm:
         // that is m / 4, the distribution's density there.
-        let above = if squared > MEDIAN_OF_TWO * self.log_factor.exp() { 0.5 } else { -0.5 };
-        let slope = MEDIAN_OF_TWO / 4.0;
+        let above = if squared > CHI_SQUARE_2_MEDIAN * self.log_factor.exp() { 0.5 } else { -0.5 };
+        let slope = CHI_SQUARE_2_MEDIAN / 4.0;
         let next = self.log_factor + above / (slope * self.draws.max(10.0));
         // Of labels that are interpolated all draws are next to nothing: what is below the least
         // that counts is not remembered.

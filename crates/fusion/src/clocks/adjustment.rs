@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 use super::batch_means::BatchMeans;
 use super::curve::{Basis, Curve, CurvePoint, TimedPlace};
 use super::window::WindowBearing;
-use crate::spatial::MEDIAN_OF_TWO;
+use crate::spatial::CHI_SQUARE_2_MEDIAN;
 use robust::{BearingCost, OUTLIER, RobustCost};
 use target::{PlaceShift, PlaceShifts, PredictedTarget};
 
@@ -168,7 +168,7 @@ impl<'a> Adjustment<'a> {
             let count = squares.len() as f64;
             let typical = match (cost, squares.get(squares.len() / 2)) {
                 (_, None) => continue,
-                (RobustCost::Huber, Some(median)) => median / MEDIAN_OF_TWO,
+                (RobustCost::Huber, Some(median)) => median / CHI_SQUARE_2_MEDIAN,
                 (RobustCost::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
             };
             // Up to three standard errors (of the median; four of the mean) above 1 are chance for

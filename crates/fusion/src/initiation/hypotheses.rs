@@ -121,7 +121,7 @@ impl Hypothesis {
     /// does not stand: a target that flies slowly passes for standing before one of them, and would
     /// be found ten seconds later. If none of its lines has been seen to come or to move, all may
     /// stand, and it needs as much more as against any other rival. If it is disputed, a third
-    /// camera does not see a target that it should see.
+    /// camera would have to miss a target that it should see: one in a hundred.
     fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
         let cameras = self.cameras();
         let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();

@@ -113,7 +113,7 @@ pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;
 
 /// Median of a chi-square of two degrees of freedom, 2 ln 2: a property of the distribution, and
 /// no choice.
-pub(crate) const MEDIAN_OF_TWO: f64 = 2.0 * LN_2;
+pub(crate) const CHI_SQUARE_2_MEDIAN: f64 = 2.0 * LN_2;
 
 /// The squared Mahalanobis distance within which a true value of `dimensions` lies with probability
 /// `p`.

@@ -59,23 +59,11 @@ pub fn publish(
     ensure_heard(&args.recording, contents, &network)?;
     tracing::info!("publishing as the cameras of `{}` in {RUN_UP_S} s", link.site());
     let delivery = if args.speed > 0.0 { Delivery::Queued } else { Delivery::Every };
-    let mut stage = Stage {
-        link,
-        delivery,
-        publishers: BTreeMap::new(),
-        alive: Vec::new(),
-        published: 0,
-        calibrations: BTreeMap::new(),
-        calibrated: Instant::now(),
-    };
+    let mut stage = Stage::new(link, delivery);
     let mut left_out = LeftOut::default();
     stage.appear(&network, args.tracks)?;
     if !range.is_whole {
-        let valid = calibrations(&args.recording, range)?.into_iter();
-        // They are none of the range's messages, and not counted among those.
-        for entry in valid.filter(|entry| LeftOut::default().admits(entry, &network)) {
-            stage.send(entry)?;
-        }
+        stage.calibrate(calibrations(&args.recording, range)?, &network)?;
     }
     let mut pass = Pass { goes_on: args.again, ..Pass::default() };
     // The run-up takes the same time at any speed.
@@ -199,6 +187,26 @@ struct Stage {
 }
 
 impl Stage {
+    fn new(link: Link, delivery: Delivery) -> Self {
+        Self {
+            link,
+            delivery,
+            publishers: BTreeMap::new(),
+            alive: Vec::new(),
+            published: 0,
+            calibrations: BTreeMap::new(),
+            calibrated: Instant::now(),
+        }
+    }
+
+    /// Publishes the calibrations that hold where a range begins. They are none of the range's
+    /// messages, and not counted among those.
+    fn calibrate(&mut self, valid: Vec<Entry>, network: &NetworkConfig) -> anyhow::Result<()> {
+        let mut uncounted = LeftOut::default();
+        let mut wanted = valid.into_iter().filter(|entry| uncounted.admits(entry, network));
+        wanted.try_for_each(|entry| self.send(entry))
+    }
+
     fn appear(&mut self, network: &NetworkConfig, and_fusion: bool) -> anyhow::Result<()> {
         for camera in network.cameras.keys() {
             self.alive.push(self.link.declare_alive(Channel::Alive(camera.clone()))?);
