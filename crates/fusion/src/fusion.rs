@@ -112,7 +112,7 @@ impl Fusion {
         Ok(Self {
             cameras: Cameras::new(&config),
             buffer: EventBuffer::new(config.event_time.clone()),
-            tracker: Tracker::new(config.tracking.clone(), config.initiation.max_range_m, motion),
+            tracker: Tracker::new(&config, motion),
             initiator: Initiator::new(&config),
             clocks: ClockEstimator::new(config.clocks.clone()),
             unmet: Unmet::new(&config.initiation),

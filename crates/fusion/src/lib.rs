@@ -54,6 +54,7 @@
 mod assignment;
 mod cameras;
 mod clocks;
+mod comparison;
 mod config;
 mod counters;
 mod cueing;

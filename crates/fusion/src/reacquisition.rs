@@ -5,14 +5,9 @@
 
 use std::collections::BTreeMap;
 
-use crossfix_filter::Gate;
-
-use crate::cameras::KnownCamera;
+use crate::comparison::{Candidate, Comparison};
 use crate::evidence::BEYOND_DOUBT;
-use crate::motion::MotionSetup;
 use crate::track::{FusedTrack, TrackId};
-use crate::visibility::log_missed;
-use crate::{Exposure, Tracking};
 
 /// A leaf whose log-likelihood ratio falls to this is given up. With half of it one miss ends a
 /// leaf of even odds; as it is, two do.
@@ -36,101 +31,66 @@ pub(crate) struct Reacquisition {
     leaves: BTreeMap<TrackId, Vec<Leaf>>,
 }
 
-/// An exposure with what it is compared by.
-pub(crate) struct ReacquisitionContext<'a> {
-    pub(crate) exposure: &'a Exposure,
-    pub(crate) known: &'a KnownCamera,
-    pub(crate) motion: &'a MotionSetup,
-    pub(crate) config: &'a Tracking,
-    pub(crate) gate: Gate,
-    pub(crate) max_range_m: f64,
-    /// The track that each sighting belongs to, if any.
+/// An exposure, and the track that each of its bearings belongs to, if any.
+pub(crate) struct OwnedExposure<'a> {
+    pub(crate) comparison: Comparison<'a>,
     pub(crate) owners: &'a [Option<TrackId>],
 }
 
-impl ReacquisitionContext<'_> {
-    /// The sightings (by index) in a track's gate, with their log-likelihood ratios against
-    /// clutter, the best first.
-    fn fits(&self, track: &FusedTrack, owner: TrackId) -> Vec<(f64, usize)> {
-        let Self { exposure, known, motion, config, .. } = self;
-        let (camera, origin) = (&exposure.camera, known.camera.pose().position());
-        let Some(expected) =
-            track.expectation(exposure.time, camera, origin, &exposure.uncertainty, motion)
-        else {
-            return Vec::new();
-        };
-        // P(detected) = P(visible) P_D.
-        let detection = track.visible_to(&exposure.camera, exposure.time, motion)
-            * config.detection_probability;
-        let open = exposure.sightings.iter().enumerate();
-        let open = open.filter(|(i, _)| self.owners[*i].is_none_or(|id| id == owner));
-        let fits = open.filter_map(|(i, sighting)| {
-            let fit = expected.fit(&sighting.line, self.gate)?;
-            Some((fit.log_ratio(detection, exposure.clutter_per_sr), i))
-        });
-        let mut fits: Vec<(f64, usize)> = fits.collect();
-        fits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-        fits
+impl OwnedExposure<'_> {
+    /// The bearings in a track's gate, the best first: those that are free, and those of `owner`.
+    fn candidates(&self, track: &FusedTrack, owner: Option<TrackId>) -> Vec<Candidate> {
+        let is_open = |index: usize| self.owners[index].is_none_or(|id| Some(id) == owner);
+        let expected = self.comparison.expectation(track);
+        expected.map_or_else(Vec::new, |expected| self.comparison.ranked(track, &expected, is_open))
     }
 
-    /// Whether the camera should see the track's target.
-    fn expects(&self, track: &FusedTrack) -> bool {
-        self.known.expects(track.position_at(self.exposure.time), self.max_range_m)
-    }
-
-    /// A copy of a track, updated with a sighting; `None` if the numbers fail.
+    /// A copy of a track, updated with a bearing; `None` if the numbers fail.
     fn taken(&self, track: &FusedTrack, index: usize) -> Option<FusedTrack> {
-        let Exposure { camera, time, sightings, .. } = self.exposure;
         let mut track = track.clone();
-        track.measurement_update(self.exposure.bearing(&sightings[index].line), self.motion)?;
-        track.note_visibility(camera, *time, true, self.config.detection_probability, self.motion);
+        self.comparison.take(&mut track, index)?;
         Some(track)
     }
 
-    /// A leaf after the exposure, with the sighting (by index) that it has used; `None` if it is
+    /// A leaf after the exposure, with the bearing (by index) that it has used; `None` if it is
     /// given up.
     fn advanced(&self, mut leaf: Leaf, owner: TrackId) -> Option<(Leaf, Option<usize>)> {
-        let Exposure { camera, time, .. } = self.exposure;
-        let best = self.fits(&leaf.track, owner).first().copied();
-        if let Some((ratio, index)) = best
+        let best = self.candidates(&leaf.track, Some(owner)).first().copied();
+        if let Some(Candidate { index, ratio, .. }) = best
             && let Some(track) = self.taken(&leaf.track, index)
         {
-            // A sighting that the track itself has used is evidence neither for nor against its
+            // A bearing that the track itself has used is evidence neither for nor against its
             // leaves.
             let gained = if self.owners[index].is_some() { 0.0 } else { ratio };
             return Some((Leaf { track, log_ratio: leaf.log_ratio + gained }, Some(index)));
         }
-        if self.expects(&leaf.track) {
-            let detection = self.config.detection_probability;
-            let visible = leaf.track.visible_to(camera, *time, self.motion);
-            leaf.log_ratio += log_missed(visible, detection);
-            leaf.track.note_visibility(camera, *time, false, detection, self.motion);
+        if self.comparison.expects(&leaf.track) {
+            leaf.log_ratio += self.comparison.log_missed(&leaf.track);
+            self.comparison.note(&mut leaf.track, false);
         }
         (leaf.log_ratio > GIVEN_UP).then_some((leaf, None))
     }
 
-    /// New leaves, one for each of the exposure's best free sightings.
+    /// New leaves, one for each of the exposure's best free bearings.
     fn begun(&self, track: &FusedTrack) -> Vec<(Leaf, Option<usize>)> {
-        if !track.is_lost_sight_of_by(&self.exposure.camera, self.motion) {
+        if !track.is_lost_sight_of_by(&self.comparison.exposure.camera) {
             return Vec::new();
         }
-        let fits =
-            self.fits(track, track.id).into_iter().filter(|(_, i)| self.owners[*i].is_none());
-        fits.take(MAX_LEAVES)
-            .filter_map(|(log_ratio, i)| {
-                Some((Leaf { track: self.taken(track, i)?, log_ratio }, Some(i)))
-            })
-            .collect()
+        let candidates = self.candidates(track, None).into_iter().take(MAX_LEAVES);
+        let leaf = |Candidate { index, ratio, .. }| {
+            Some((Leaf { track: self.taken(track, index)?, log_ratio: ratio }, Some(index)))
+        };
+        candidates.filter_map(leaf).collect()
     }
 }
 
 impl Reacquisition {
     /// Continues the leaves of all tracks that one camera alone follows; returns the tracks that
-    /// are found again, with the sighting (by index) that has settled it.
+    /// are found again, with the bearing (by index) that has settled it.
     pub(crate) fn advance(
         &mut self,
         tracks: &BTreeMap<TrackId, FusedTrack>,
-        context: &ReacquisitionContext<'_>,
+        exposure: &OwnedExposure<'_>,
     ) -> Vec<(FusedTrack, Option<usize>)> {
         self.leaves.retain(|id, _| tracks.get(id).is_some_and(|track| !track.is_triangulated()));
         let mut found = Vec::new();
@@ -139,8 +99,8 @@ impl Reacquisition {
         for track in alone {
             let before = self.leaves.remove(&track.id).unwrap_or_default();
             let mut next: Vec<_> =
-                before.into_iter().filter_map(|leaf| context.advanced(leaf, track.id)).collect();
-            next.extend(context.begun(track));
+                before.into_iter().filter_map(|leaf| exposure.advanced(leaf, track.id)).collect();
+            next.extend(exposure.begun(track));
             // Old leaves and new ones compete for the same few places.
             next.sort_by(|a, b| b.0.log_ratio.total_cmp(&a.0.log_ratio));
             next.truncate(MAX_LEAVES);

@@ -148,6 +148,8 @@ pub struct FusedTrack {
     /// Fisher information of the recent bearings on position and velocity.
     information: Matrix6<f64>,
     detector: Option<ManoeuvreDetector>,
+    /// How long after its bearing a camera counts as one that holds (supports) the track, s.
+    holding_s: f64,
 }
 
 /// A line of the fix that a track starts from.
@@ -189,6 +191,7 @@ impl FusedTrack {
             past: VecDeque::new(),
             information: Matrix6::zeros(),
             detector: motion.detector(),
+            holding_s: motion.holding_s,
         };
         for StartLine { camera, line, uncertainty } in lines {
             track.note_start(fix, camera, line, &uncertainty);
@@ -307,23 +310,23 @@ impl FusedTrack {
     }
 
     /// How many other cameras than this one have lately seen the target.
-    pub(crate) fn others_than(&self, camera: &CameraName, motion: &MotionSetup) -> usize {
-        let lately = |ties: &Ties| ties.has_seen_lately(self.updated_at, motion.holding_s);
+    pub(crate) fn others_than(&self, camera: &CameraName) -> usize {
+        let lately = |ties: &Ties| ties.has_seen_lately(self.updated_at, self.holding_s);
         self.ties.iter().filter(|(name, ties)| lately(ties) && *name != camera).count()
     }
 
     /// Whether a camera has lately given the track a bearing.
-    fn is_followed_by(&self, camera: &CameraName, motion: &MotionSetup) -> bool {
+    fn is_followed_by(&self, camera: &CameraName) -> bool {
         self.ties
             .get(camera)
-            .is_some_and(|ties| ties.has_seen_lately(self.updated_at, motion.holding_s))
+            .is_some_and(|ties| ties.has_seen_lately(self.updated_at, self.holding_s))
     }
 
     /// Whether the track is too uncertain to be associated directly with a camera that has not been
     /// following it: any line that crosses the other camera's sight line would pass for its target.
-    pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName, motion: &MotionSetup) -> bool {
+    pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName) -> bool {
         !self.triangulated
-            && !self.is_followed_by(camera, motion)
+            && !self.is_followed_by(camera)
             && self.position_sd() > MAX_PAIR_SHARE * self.range()
     }
 
@@ -342,13 +345,8 @@ impl FusedTrack {
 
     /// Probability that the target is visible to a camera at a time, given what that camera has
     /// seen so far.
-    pub(crate) fn visible_to(
-        &self,
-        camera: &CameraName,
-        time: Timestamp,
-        motion: &MotionSetup,
-    ) -> f64 {
-        let visibility = |ties: &Ties| ties.visibility.at(time, motion.holding_s);
+    pub(crate) fn visible_to(&self, camera: &CameraName, time: Timestamp) -> f64 {
+        let visibility = |ties: &Ties| ties.visibility.at(time, self.holding_s);
         self.ties.get(camera).map_or(Visibility::UNKNOWN, visibility)
     }
 
@@ -365,11 +363,11 @@ impl FusedTrack {
         time: Timestamp,
         seen: bool,
         detection: f64,
-        motion: &MotionSetup,
     ) {
         self.note(camera, time);
+        let holding_s = self.holding_s;
         if let Some(ties) = self.ties.get_mut(camera) {
-            ties.visibility.update(time, seen, detection, motion.holding_s);
+            ties.visibility.update(time, seen, detection, holding_s);
         }
     }
 
@@ -428,12 +426,12 @@ impl FusedTrack {
         } else {
             self.residuals.insert(camera.clone(), residual);
         }
-        let lately = |ties: &&Ties| ties.has_seen_lately(time, motion.holding_s);
+        let lately = |ties: &&Ties| ties.has_seen_lately(time, self.holding_s);
         self.triangulated = self.ties.values().filter(lately).count() >= 2;
-        let sees = |ties: &&Ties| ties.sees(time, motion.holding_s);
+        let sees = |ties: &&Ties| ties.sees(time, self.holding_s);
         self.ranged = self.ties.values().filter(sees).count() >= 2;
         self.gather(&bearing, &innovation);
-        let third_differences = self.third_differences(camera, line, motion);
+        let third_differences = self.third_differences(camera, line);
         Some(Taken { manoeuvre, third_differences })
     }
 

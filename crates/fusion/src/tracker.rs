@@ -6,20 +6,21 @@ mod life;
 
 use std::collections::BTreeMap;
 
-use crossfix_filter::{Gate, KinematicState};
+use crossfix_filter::KinematicState;
 use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 
 use crate::cameras::{
     Cameras, ClockChange, Fitting, Fittings, KnownCamera, Rooted, ScaleSample, ThirdDifferences,
 };
+use crate::comparison::{Candidate, Comparison, ComparisonRules};
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
-use crate::reacquisition::{Reacquisition, ReacquisitionContext};
-use crate::track::{FusedTrack, TrackExpectation, TrackId, TrackStatus};
+use crate::reacquisition::{OwnedExposure, Reacquisition};
+use crate::track::{FusedTrack, TrackId, TrackStatus};
 
 use association::fitting;
 
-use crate::{Exposure, Sighting, Tracking};
+use crate::{Exposure, FusionConfig, Sighting, Tracking};
 
 /// Gate for merging: two positions closer than this (squared Mahalanobis distance, three degrees of
 /// freedom, P = 0.99) are one target if one of the tracks is coasting. With half of it one such
@@ -48,9 +49,7 @@ impl TrackChange {
 pub(crate) struct Tracker {
     config: Tracking,
     motion: MotionSetup,
-    gate: Gate,
-    /// Beyond this range no camera is expected to see a target, m.
-    max_range_m: f64,
+    rules: ComparisonRules,
     tracks: BTreeMap<TrackId, FusedTrack>,
     /// Time of the first exposure of the run.
     began: Option<Timestamp>,
@@ -98,13 +97,11 @@ pub(crate) struct TrackerStep {
 }
 
 impl Tracker {
-    pub(crate) fn new(config: Tracking, max_range_m: f64, motion: MotionSetup) -> Self {
-        let gate = Gate::with_probability(config.gate_probability);
+    pub(crate) fn new(config: &FusionConfig, motion: MotionSetup) -> Self {
         Self {
-            config,
+            config: config.tracking.clone(),
             motion,
-            gate,
-            max_range_m,
+            rules: ComparisonRules::new(config),
             tracks: BTreeMap::new(),
             began: None,
             next_number: 1,
@@ -178,44 +175,37 @@ impl Tracker {
         exposure: &Exposure,
         known: &KnownCamera,
     ) -> (Fittings, Vec<UsedSighting>) {
-        let seen = self.tracks.values().filter(|track| {
-            track.is_confirmed()
-                && track.others_than(&exposure.camera, &self.motion) >= 2
-                && known.expects(track.position_at(exposure.time), self.max_range_m)
-        });
+        let comparison = self.comparison(exposure, known);
         let (mut fittings, mut used) = (Fittings::default(), Vec::new());
-        for track in seen {
-            let nearest = self.nearest_sighting(track, exposure, known);
-            let others = track.others_than(&exposure.camera, &self.motion);
+        for track in self.expected_by_others(comparison) {
+            let nearest = comparison.expectation(track).and_then(|expected| {
+                let near = comparison.candidates(track, &expected, |_| true);
+                let distance = |candidate: &Candidate| candidate.fit.gate_distance;
+                near.min_by(|a, b| distance(a).total_cmp(&distance(b)))
+            });
+            let others = track.others_than(&exposure.camera);
             fittings.add(others, fitting(track, exposure, known, nearest.is_some()));
-            used.extend(nearest.map(|index| UsedSighting { index, track: track.id }));
+            let id = track.id;
+            used.extend(nearest.map(|nearest| UsedSighting { index: nearest.index, track: id }));
         }
         (fittings, used)
     }
 
-    /// The index of the bearing of an exposure that fits a track best.
-    fn nearest_sighting(
-        &self,
-        track: &FusedTrack,
-        exposure: &Exposure,
-        known: &KnownCamera,
-    ) -> Option<usize> {
-        let expected = self.expectation(track, exposure, known)?;
-        let fits = exposure.sightings.iter().enumerate();
-        let fits =
-            fits.filter_map(|(i, s)| Some((expected.fit(&s.line, self.gate)?.gate_distance, i)));
-        fits.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, nearest)| nearest)
+    /// An exposure with what its bearings are compared by.
+    fn comparison<'a>(&'a self, exposure: &'a Exposure, known: &'a KnownCamera) -> Comparison<'a> {
+        Comparison { exposure, known, motion: &self.motion, rules: self.rules }
     }
 
-    /// The predicted bearing of a track in an exposure.
-    fn expectation(
-        &self,
-        track: &FusedTrack,
-        exposure: &Exposure,
-        known: &KnownCamera,
-    ) -> Option<TrackExpectation> {
-        let (camera, origin) = (&exposure.camera, known.camera.pose().position());
-        track.expectation(exposure.time, camera, origin, &exposure.uncertainty, &self.motion)
+    /// The confirmed tracks that an exposure's camera should see, and two others see.
+    fn expected_by_others<'a>(
+        &'a self,
+        comparison: Comparison<'a>,
+    ) -> impl Iterator<Item = &'a FusedTrack> {
+        self.tracks.values().filter(move |track| {
+            track.is_confirmed()
+                && track.others_than(&comparison.exposure.camera) >= 2
+                && comparison.expects(track)
+        })
     }
 
     /// How targets move.
@@ -245,22 +235,16 @@ impl Tracker {
     /// How well an exposure fits the confirmed tracks: the sum over the tracks of the best
     /// log-likelihood ratio, of a bearing being this track's against being clutter.
     pub(crate) fn fit(&self, exposure: &Exposure, known: &KnownCamera) -> f64 {
+        let comparison = self.comparison(exposure, known);
         let confirmed = self.tracks.values().filter(|track| track.is_confirmed());
-        confirmed.filter_map(|track| self.best_ratio(track, exposure, known)).sum()
-    }
-
-    /// The best log-likelihood ratio of a bearing being this track's; `None` without one in its
-    /// gate.
-    fn best_ratio(
-        &self,
-        track: &FusedTrack,
-        exposure: &Exposure,
-        known: &KnownCamera,
-    ) -> Option<f64> {
-        let expected = self.expectation(track, exposure, known)?;
-        let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
-        // ln(N / clutter), P_D left out: it is the same for both times that are compared.
-        fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
+        let best = confirmed.filter_map(|track| {
+            let expected = comparison.expectation(track)?;
+            let near = comparison.candidates(track, &expected, |_| true);
+            // ln(N / clutter), P_D left out: it is the same for both times that are compared.
+            near.map(|one| one.fit.log_ratio(1.0, self.config.clutter_per_sr))
+                .max_by(f64::total_cmp)
+        });
+        best.sum()
     }
 
     /// Handles one exposure: bearings that belong to tracks update them.
@@ -322,12 +306,7 @@ impl Tracker {
         known: &KnownCamera,
         owners: &[Option<TrackId>],
     ) -> Option<Fitting> {
-        let mut expected = self.tracks.values().filter(|track| {
-            track.is_confirmed()
-                && track.others_than(&exposure.camera, &self.motion) >= 2
-                && known.expects(track.position_at(exposure.time), self.max_range_m)
-        });
-        expected.next()?;
+        self.expected_by_others(self.comparison(exposure, known)).next()?;
         // What was there when the camera began to look, or since its mount turned, may stand there.
         let mut others = exposure.sightings.iter().filter(|seen| seen.rooted == Rooted::No);
         let is_alone = owners.iter().all(Option::is_none) && others.next().is_some();
@@ -368,17 +347,10 @@ impl Tracker {
         known: &KnownCamera,
         owners: &mut [Option<TrackId>],
     ) {
-        let context = ReacquisitionContext {
-            exposure,
-            known,
-            motion: &self.motion,
-            config: &self.config,
-            gate: self.gate,
-            max_range_m: self.max_range_m,
-            owners,
-        };
-        for (track, sighting) in self.reacquisition.advance(&self.tracks, &context) {
-            if let Some(owner) = sighting.and_then(|index| owners.get_mut(index)) {
+        let comparison = Comparison { exposure, known, motion: &self.motion, rules: self.rules };
+        let owned = OwnedExposure { comparison, owners };
+        for (track, bearing) in self.reacquisition.advance(&self.tracks, &owned) {
+            if let Some(owner) = bearing.and_then(|index| owners.get_mut(index)) {
                 *owner = Some(track.id);
             }
             let mut track = track;

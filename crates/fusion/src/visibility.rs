@@ -21,10 +21,10 @@ const HIDDEN: f64 = 0.075;
 /// less against a ghost.
 const APPEARS: f64 = 0.75;
 
-/// Log-likelihood ratio of a missed report, for a target that the camera can see with probability
-/// `visible` and then reports with probability `detection`.
-pub(crate) fn log_missed(visible: f64, detection: f64) -> f64 {
-    (1.0 - visible * detection).ln()
+/// Log-likelihood ratio of a missed report, for a target that the camera reports with probability
+/// `detection`.
+pub(crate) fn log_missed(detection: f64) -> f64 {
+    (1.0 - detection).ln()
 }
 
 /// Whether a camera can see a target: a Markov chain of two states, visible and hidden. A camera

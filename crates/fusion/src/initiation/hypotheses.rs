@@ -5,23 +5,22 @@ mod pruning;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crossfix_filter::Gate;
 use crossfix_message::{CameraName, Solver, Timestamp};
 
 use super::one_target::{Mobility, OneTargetTest};
 use super::seeds::{Seed, SeedFinder};
 use super::selection::{PeriodLine, ScoredLines, Selection};
-use super::{NamedLine, NewTrack, lines_of};
-use crate::cameras::Rooted;
-use crate::cameras::{Cameras, KnownCamera};
+use super::{MAX_LINES, NewTrack};
+use crate::cameras::{Cameras, KnownCamera, Rooted};
+use crate::comparison::{Candidate, Comparison, ComparisonRules};
 use crate::evidence::{BEYOND_DOUBT, ONE_IN_A_HUNDRED};
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
-use crate::track::{FusedTrack, StartLine, TrackBearing, TrackExpectation, TrackId, TrackStatus};
+use crate::track::{FusedTrack, StartLine, TrackExpectation, TrackId, TrackStatus};
 use crate::tracker::{UsedSighting, same_target};
 use crate::uncertainty::CameraUncertainty;
 use crate::visibility::log_missed;
-use crate::{Exposure, FusionConfig, Tracking};
+use crate::{Exposure, FusionConfig};
 
 /// Bounds on time and memory, however much clutter there is; the best are kept.
 struct HypothesisBounds {
@@ -72,15 +71,14 @@ struct Hypothesis {
 #[derive(Debug)]
 pub(super) struct Hypotheses {
     finder: SeedFinder,
-    tracking: Tracking,
-    gate: Gate,
+    rules: ComparisonRules,
+    confirm_score: f64,
     /// Number of periods for which a hypothesis keeps its lines.
     span: u64,
     /// Number of periods that must have given it a line before it is confirmed.
     needed: usize,
     /// How long two cameras alone must agree, s.
     pair_s: f64,
-    max_range_m: f64,
     /// Speed of targets, m/s, standard deviation per axis.
     speed: f64,
     shared_lines: usize,
@@ -147,29 +145,15 @@ impl Hypothesis {
     }
 }
 
-/// An exposure with what its lines are compared by.
-#[derive(Clone, Copy)]
-struct HypothesisContext<'a> {
-    exposure: &'a Exposure,
-    known: &'a KnownCamera,
-    motion: &'a MotionSetup,
-    lines: &'a [NamedLine],
-    uncertainty: CameraUncertainty,
-    detection: f64,
-    /// Time since the camera's exposure before, s.
-    interval_s: f64,
-}
-
 impl Hypotheses {
     pub(super) fn new(config: &FusionConfig) -> Self {
         Self {
             finder: SeedFinder::new(config, 2, LEAST_SCORE),
-            gate: Gate::with_probability(config.tracking.gate_probability),
-            tracking: config.tracking.clone(),
+            rules: ComparisonRules::new(config),
+            confirm_score: config.tracking.confirm_score,
             span: config.initiation.periods as u64,
             needed: config.initiation.fixes,
             pair_s: config.initiation.pair_s,
-            max_range_m: config.initiation.max_range_m,
             speed: config.initiation.velocity_prior_sd_mps,
             shared_lines: config.initiation.shared_lines,
             hypotheses: Vec::new(),
@@ -233,127 +217,83 @@ impl Hypotheses {
 
     /// Continues every hypothesis with each bearing in its gate, and without any.
     fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &MotionSetup) {
-        let lines: Vec<NamedLine> = lines_of(exposure).collect();
-        // The velocity of a hypothesis is hardly known, and so neither is the shift by the clock's
-        // error.
-        let uncertainty = CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty };
-        let detection = self.tracking.detection_probability;
         let before = self.exposed.insert(exposure.camera.clone(), exposure.time);
         let interval_s = before.map_or(f64::INFINITY, |before| exposure.time.seconds_since(before));
-        let context = HypothesisContext {
-            exposure,
-            known,
-            motion,
-            lines: &lines,
-            uncertainty,
-            detection,
-            interval_s,
-        };
+        let comparison = Comparison { exposure, known, motion, rules: self.rules };
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for hypothesis in std::mem::take(&mut self.hypotheses) {
-            self.extend_one(hypothesis, &context, &mut next);
+            self.extend_one(hypothesis, &comparison, interval_s, &mut next);
         }
         self.hypotheses = next;
         self.prune_trees();
     }
 
     /// Continues one hypothesis with each bearing in its gate that is likely enough compared with
-    /// the likeliest continuation, and without any if that is.
+    /// the likeliest continuation, and without any if that is. The camera's exposure before was
+    /// `interval_s` earlier.
     fn extend_one(
         &self,
         mut hypothesis: Hypothesis,
-        context: &HypothesisContext<'_>,
+        comparison: &Comparison<'_>,
+        interval_s: f64,
         next: &mut Vec<Hypothesis>,
     ) {
-        let HypothesisContext {
-            exposure,
-            known,
-            motion,
-            lines,
-            uncertainty,
-            detection,
-            interval_s,
-        } = *context;
-        let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
-        let prediction = hypothesis.track.expectation(
-            exposure.time,
-            &exposure.camera,
-            known.camera.pose().position(),
-            &uncertainty,
-            motion,
-        );
-        let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
+        let is_expected = comparison.expects(&hypothesis.track);
         // If the target is outside the camera's view, a hypothesis without a line costs nothing.
-        let miss = if expected { log_missed(visible, detection) } else { 0.0 };
-        let near = lines.iter().enumerate().filter_map(|(i, (_, line))| {
-            let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
-            Some((fit.log_ratio(visible * detection, exposure.clutter_per_sr), i))
+        let miss = if is_expected { comparison.log_missed(&hypothesis.track) } else { 0.0 };
+        let prediction = comparison.expectation(&hypothesis.track);
+        let is_open = |index: usize| index < MAX_LINES;
+        let near = prediction.as_ref().map_or_else(Vec::new, |prediction| {
+            comparison.ranked(&hypothesis.track, prediction, is_open)
         });
-        let mut near: Vec<(f64, usize)> = near.collect();
-        near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         // The likeliest continuation, with a bearing or without.
-        let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
-        near.retain(|(ratio, _)| *ratio > miss && *ratio > best - BEYOND_DOUBT);
-        near.truncate(BOUNDS.branches);
+        let best = near.first().map_or(miss, |likeliest| likeliest.ratio.max(miss));
+        let likely = |one: &Candidate| one.ratio > miss && one.ratio > best - BEYOND_DOUBT;
+        let likely = near.into_iter().filter(likely).take(BOUNDS.branches);
         let before = next.len();
-        next.extend(near.into_iter().filter_map(|(ratio, index)| {
-            self.continued_with(index, ratio, hypothesis.clone(), context, prediction.as_ref())
+        next.extend(likely.filter_map(|candidate| {
+            self.continued_with(candidate, hypothesis.clone(), comparison, prediction.as_ref())
         }));
         if miss <= best - BEYOND_DOUBT && next.len() > before {
             return;
         }
-        if expected {
+        if is_expected {
             // ln(1 - P(visible) P_D); against one target per camera, ln(1 - P_D) alone.
             hypothesis.track.score += miss;
-            hypothesis.track.note_visibility(
-                &exposure.camera,
-                exposure.time,
-                false,
-                detection,
-                motion,
-            );
-            hypothesis.one_target.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
+            comparison.note(&mut hypothesis.track, false);
+            let missed = log_missed(self.rules.detection);
+            hypothesis.one_target.miss(&comparison.exposure.camera, missed, interval_s);
         }
         next.push(hypothesis);
     }
 
-    /// A hypothesis continued with a bearing, given by its index and its log-likelihood ratio.
+    /// A hypothesis continued with a bearing.
     fn continued_with(
         &self,
-        index: usize,
-        ratio: f64,
+        Candidate { index, ratio, .. }: Candidate,
         mut hypothesis: Hypothesis,
-        context: &HypothesisContext<'_>,
+        comparison: &Comparison<'_>,
         prediction: Option<&TrackExpectation>,
     ) -> Option<Hypothesis> {
-        let HypothesisContext { exposure, motion, lines, uncertainty, detection, .. } = *context;
-        let (id, line) = &lines[index];
-        let bearing = TrackBearing { uncertainty: &uncertainty, ..exposure.bearing(&line.line) };
+        let Comparison { exposure, motion, .. } = *comparison;
         // Taken before the update, as the prediction that the bearing is compared with.
         let density = motion.density(hypothesis.track.model_probabilities());
-        hypothesis.track.measurement_update(bearing, motion)?;
+        comparison.take(&mut hypothesis.track, index)?;
         hypothesis.track.score += ratio;
-        hypothesis.track.note_visibility(&exposure.camera, exposure.time, true, detection, motion);
         if let Some(TrackExpectation::Near(prediction)) = prediction {
             let mobility = Mobility { density, speed: self.speed };
-            hypothesis.one_target.see(&bearing, prediction, mobility, ratio);
+            hypothesis.one_target.see(&comparison.bearing(index), prediction, mobility, ratio);
         }
-        hypothesis.lines.push(PeriodLine { period: self.period, id: id.clone() });
+        let id = LineId::new(exposure, index);
+        hypothesis.lines.push(PeriodLine { period: self.period, id });
         hypothesis.rooted.insert(exposure.camera.clone(), exposure.sightings[index].rooted);
         Some(hypothesis)
     }
 
     /// Starts a hypothesis from every seed.
     fn begin(&mut self, seeds: Vec<Seed>, exposures: &[&Exposure], motion: &MotionSetup) {
-        let uncertainty: BTreeMap<&CameraName, CameraUncertainty> = exposures
-            .iter()
-            .map(|exposure| {
-                (
-                    &exposure.camera,
-                    CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty },
-                )
-            })
-            .collect();
+        let uncertainty: BTreeMap<&CameraName, CameraUncertainty> =
+            exposures.iter().map(|exposure| (&exposure.camera, exposure.uncertainty)).collect();
         for seed in seeds {
             let Some(time) = seed.time() else {
                 continue;
@@ -450,7 +390,7 @@ impl Hypotheses {
         agreed
             && is_one
             && !hypothesis.stands()
-            && track.score >= self.tracking.confirm_score
+            && track.score >= self.confirm_score
             && hypothesis.periods >= self.needed
     }
 

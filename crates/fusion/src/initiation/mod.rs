@@ -106,7 +106,9 @@ impl Initiator {
         motion: &MotionSetup,
     ) -> Vec<NewTrack> {
         match self.method {
-            Method::Hypotheses(_) => self.handover.see(exposure, used, known, motion),
+            Method::Hypotheses(_) => {
+                self.handover.see(&of_unknown_velocity(exposure.clone()), used, known, motion)
+            }
             Method::Grouped(_) => Vec::new(),
         }
     }
@@ -115,13 +117,14 @@ impl Initiator {
     /// are those that a track has used which only one camera supports.
     pub(crate) fn add(
         &mut self,
-        exposure: Exposure,
+        mut exposure: Exposure,
         provisional: &[UsedSighting],
         cameras: &Cameras,
         motion: &MotionSetup,
     ) -> Vec<NewTrack> {
         if let Method::Hypotheses(hypotheses) = &mut self.method {
             hypotheses.note_provisional(&exposure, provisional);
+            exposure = of_unknown_velocity(exposure);
         }
         let Some(period) = self.periods.add(exposure, cameras.len()) else {
             return Vec::new();
@@ -133,6 +136,13 @@ impl Initiator {
             Method::Grouped(grouped) => grouped.advance(&exposures, cameras, motion),
         }
     }
+}
+
+/// The exposure for targets whose velocity is hardly known, and with it what the clock's error
+/// shifts: that counts as noise of each bearing.
+fn of_unknown_velocity(mut exposure: Exposure) -> Exposure {
+    exposure.uncertainty.clock_is_noise = true;
+    exposure
 }
 
 /// An exposure's sight lines with their names, without the pose's uncertainty.

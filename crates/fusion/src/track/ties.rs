@@ -11,7 +11,6 @@ use nalgebra::{Dyn, Matrix2, Matrix2x3, Matrix2x6, OMatrix, U5, Unit, Vector2, V
 
 use super::{BearingInnovation, FusedTrack, TrackBearing};
 use crate::cameras::{ClockChange, RecentBearings, ScaleSample, ThirdDifferences};
-use crate::motion::MotionSetup;
 use crate::uncertainty::{CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies};
 use crate::update::{CrossUpdate, ModelUpdate, Updated};
 use crate::visibility::Visibility;
@@ -29,7 +28,7 @@ pub(super) struct Rescaling {
 }
 
 /// Longest interval between bearings whose third difference is used, as a share of the holding time
-/// ([`MotionSetup::holding_s`], how long after a bearing its camera still supports the track): over
+/// ([`FusedTrack::holding_s`], how long after a bearing its camera still supports the track): over
 /// longer intervals noise cannot be told from jerk. By default that is 0.15 s: with half of it
 /// cameras of 10 Hz show nothing of their white noise.
 const CLOSE_BEARINGS: f64 = 0.1;
@@ -377,15 +376,15 @@ impl FusedTrack {
         &mut self,
         camera: &CameraName,
         line: &SightLine,
-        motion: &MotionSetup,
     ) -> Option<ThirdDifferences> {
         let (now, state) = (self.updated_at, self.imm.combined());
         let (place, velocity) = (state.position(), state.velocity());
         let expected = |time: Timestamp| {
             Unit::try_new(place + velocity * time.seconds_since(now) - line.origin, 1e-6)
         };
+        let longest_s = self.holding_s * CLOSE_BEARINGS;
         let recent = &mut self.ties.get_mut(camera)?.recent;
-        Some(recent.see(now, line, motion.holding_s * CLOSE_BEARINGS, expected))
+        Some(recent.see(now, line, longest_s, expected))
     }
 
     /// Updates what is known of all cameras' errors after a bearing has updated the models, by the

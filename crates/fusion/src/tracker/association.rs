@@ -6,13 +6,11 @@ use crossfix_message::TrackEventKind;
 
 use super::{Noted, TrackChange, Tracker};
 use crate::assignment::{Pairing, assign};
-use crate::cameras::Fitting;
-use crate::cameras::KnownCamera;
+use crate::cameras::{Fitting, KnownCamera};
+use crate::comparison::{Candidate, Comparison};
 use crate::evidence::BEYOND_DOUBT;
-use crate::motion::MotionSetup;
 use crate::track::{FusedTrack, TrackId, TrackStatus};
-use crate::visibility::log_missed;
-use crate::{Exposure, Sighting, Tracking};
+use crate::{Exposure, Sighting};
 
 /// A camera's bearings are not compared with tracks farther from it than this many times the
 /// largest range. With half of it a target loses its bearings before it leaves that range.
@@ -51,7 +49,8 @@ impl Tracker {
         owners: &mut [Option<TrackId>],
         noted: &mut Noted,
     ) {
-        let candidates = self.candidates(exposure, known, owners, ids);
+        let candidates = self.pairings(exposure, known, owners, ids);
+        let comparison = Comparison { exposure, known, motion: &self.motion, rules: self.rules };
         let gains: BTreeMap<(usize, usize), f64> =
             candidates.iter().map(|c| ((c.row, c.column), c.gain)).collect();
         let partner = assign(&candidates);
@@ -62,32 +61,29 @@ impl Tracker {
             let sure = track.is_confirmed();
             let column = partner.get(&row).copied();
             let taken = column.and_then(|column| {
-                let sighting = &exposure.sightings[column];
-                let bearing = exposure.bearing(&sighting.line);
+                let bearing = comparison.bearing(column);
                 let taken = track.measurement_update(bearing, &self.motion)?;
                 owners[column] = Some(*id);
                 Some(taken)
             });
             let gain = taken.and(column).and_then(|column| gains.get(&(row, column))).copied();
-            let sees = known.expects(track.position_at(exposure.time), self.max_range_m);
+            let sees = comparison.expects(track);
             if sure && taken.is_none() && track.is_triangulated() {
                 note_beside(track, exposure, known);
             }
             if sure && (taken.is_some() || sees) {
-                let others = track.others_than(&exposure.camera, &self.motion);
+                let others = track.others_than(&exposure.camera);
                 noted.fittings.add(others, fitting(track, exposure, known, taken.is_some()));
             }
             noted
                 .third_differences
                 .extend(taken.filter(|_| sure).and_then(|taken| taken.third_differences));
             let evidence = Evidence { gain, sees, sure };
-            let change = evidence.score_change(track, exposure, &self.config, &self.motion);
+            let change = evidence.score_change(track, &comparison, self.config.coasting_after_s);
             track.add_evidence(change, MAX_SCORE);
             // A camera misses nothing outside its field of view.
             if gain.is_some() || sees {
-                let detection = self.config.detection_probability;
-                let (camera, time) = (&exposure.camera, exposure.time);
-                track.note_visibility(camera, time, gain.is_some(), detection, &self.motion);
+                comparison.note(track, gain.is_some());
             }
             if taken.is_some_and(|taken| taken.manoeuvre) {
                 noted.changes.push(TrackChange::new(TrackEventKind::Manoeuvre, *id));
@@ -97,7 +93,7 @@ impl Tracker {
 
     /// The possible pairs of these tracks and free bearings in their gates, with the gain of each:
     /// its log-likelihood ratio against clutter, less that of a miss.
-    fn candidates(
+    fn pairings(
         &self,
         exposure: &Exposure,
         known: &KnownCamera,
@@ -108,39 +104,28 @@ impl Tracker {
         // of.
         let least_log_density = exposure.clutter_per_sr.ln() + BEYOND_DOUBT;
         let origin = known.camera.pose().position();
-        let mut candidates = Vec::new();
+        let comparison = self.comparison(exposure, known);
+        let mut pairings = Vec::new();
         for (row, track) in
             ids.iter().enumerate().filter_map(|(row, id)| Some((row, self.tracks.get(id)?)))
         {
-            if (track.position_at(exposure.time) - origin).norm() > REACH * self.max_range_m {
+            if (track.position_at(exposure.time) - origin).norm() > REACH * self.rules.max_range_m {
                 continue;
             }
-            let prediction = track.expectation(
-                exposure.time,
-                &exposure.camera,
-                origin,
-                &exposure.uncertainty,
-                &self.motion,
-            );
-            let Some(prediction) = prediction else {
+            let Some(expected) = comparison.expectation(track) else {
                 continue;
             };
-            let detection = self.config.detection_probability;
-            let visible = track.visible_to(&exposure.camera, exposure.time, &self.motion);
-            let lost_sight = track.is_lost_sight_of_by(&exposure.camera, &self.motion);
-            let open = exposure.sightings.iter().enumerate().filter(|(i, _)| owners[*i].is_none());
-            for (column, sighting) in open {
-                let fit = prediction.fit(&sighting.line, self.gate);
-                if let Some(fit) =
-                    fit.filter(|fit| !lost_sight || fit.log_density > least_log_density)
-                {
-                    let gain = fit.log_ratio(visible * detection, exposure.clutter_per_sr)
-                        - log_missed(visible, detection);
-                    candidates.push(Pairing { row, column, gain });
-                }
-            }
+            let missed = comparison.log_missed(track);
+            let lost_sight = track.is_lost_sight_of_by(&exposure.camera);
+            let near = comparison.candidates(track, &expected, |index| owners[index].is_none());
+            let near = near.filter(|one| !lost_sight || one.fit.log_density > least_log_density);
+            pairings.extend(near.map(|Candidate { index, ratio, .. }| Pairing {
+                row,
+                column: index,
+                gain: ratio - missed,
+            }));
         }
-        candidates
+        pairings
     }
 }
 
@@ -160,14 +145,13 @@ impl Evidence {
     fn score_change(
         &self,
         track: &FusedTrack,
-        exposure: &Exposure,
-        config: &Tracking,
-        motion: &MotionSetup,
+        comparison: &Comparison<'_>,
+        coasting_after_s: f64,
     ) -> f64 {
-        let visible = track.visible_to(&exposure.camera, exposure.time, motion);
-        let missed = log_missed(visible, config.detection_probability);
+        let exposure = comparison.exposure;
+        let missed = comparison.log_missed(track);
         let silent_s = exposure.time.seconds_since(track.updated_at);
-        let silent = self.sure && silent_s > config.coasting_after_s;
+        let silent = self.sure && silent_s > coasting_after_s;
         let seen_since = !self.sure || track.is_seen_since_exposure_of(&exposure.camera);
         match self.gain {
             // No evidence for the target: what one camera alone follows may be anything along its

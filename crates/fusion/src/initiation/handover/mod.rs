@@ -21,6 +21,7 @@ use self::reading::{Reading, ReadingContext, Rules, TOGETHER_S};
 use self::seen::{SeenDirection, pose_variance};
 use super::{NewTrack, lines_with_pose};
 use crate::cameras::{KnownCamera, Rooted};
+use crate::comparison::Comparison;
 use crate::cueing::CueTarget;
 use crate::evidence::BEYOND_DOUBT;
 use crate::motion::MotionSetup;
@@ -87,7 +88,7 @@ impl Handover {
     /// unknown.
     pub(super) fn known(&self, now: Timestamp) -> Vec<CueTarget> {
         // Geometric mean: the middle of ln r.
-        let range = (NEAREST_M * self.rules.max_range_m).sqrt();
+        let range = (NEAREST_M * self.rules.comparison.max_range_m).sqrt();
         let Rules { tracking, speed, .. } = &self.rules;
         let all =
             self.seen.iter().flat_map(|(camera, seen)| seen.iter().map(move |one| (camera, one)));
@@ -106,7 +107,8 @@ impl Handover {
     ) -> Vec<NewTrack> {
         let mut is_owned = vec![false; exposure.sightings.len()];
         used.iter().for_each(|used| is_owned[used.index] = true);
-        let context = ReadingContext { exposure, known, motion, is_owned: &is_owned };
+        let comparison = Comparison { exposure, known, motion, rules: self.rules.comparison };
+        let context = ReadingContext { comparison, is_owned: &is_owned };
         self.forget(exposure.time);
         let begun = self.follow(&context);
         self.advance(&context);
@@ -132,13 +134,14 @@ impl Handover {
     /// Continues the directions that the exposure's camera follows; returns the lines that continue
     /// them.
     fn follow(&mut self, context: &ReadingContext<'_>) -> Vec<ContinuedLine> {
-        let ReadingContext { exposure, known, is_owned, .. } = *context;
+        let ReadingContext { comparison: Comparison { exposure, known, .. }, is_owned } = *context;
         let factor = exposure.uncertainty.factor;
         let clutter = self.rules.clutter_per_sr(known).ln();
         let with_pose: Vec<TimedLine> = lines_with_pose(exposure).map(|(_, line)| line).collect();
         let seen = self.seen.entry(exposure.camera.clone()).or_default();
         let mut taken = vec![false; with_pose.len()];
-        let (gate, mut begun, mut explained) = (self.rules.gate, Vec::new(), BTreeSet::new());
+        let (gate, mut begun, mut explained) =
+            (self.rules.comparison.gate, Vec::new(), BTreeSet::new());
         let is_known = |i: usize| is_owned[i] || exposure.sightings[i].rooted == Rooted::Yes;
         // The best known directions choose first; a lost one takes only a line that is clearly no
         // other target's.
@@ -200,7 +203,7 @@ impl Handover {
     /// Starts readings: combines what other cameras have lost sight of with what this camera has
     /// begun to see since.
     fn cross(&mut self, context: &ReadingContext<'_>, begun: &[ContinuedLine]) {
-        let ReadingContext { exposure, is_owned, .. } = *context;
+        let ReadingContext { comparison: Comparison { exposure, .. }, is_owned } = *context;
         let now = exposure.time;
         let others = self.seen.iter_mut().filter(|(camera, _)| **camera != exposure.camera);
         let lost = others.flat_map(|(camera, seen)| seen.iter_mut().map(move |one| (camera, one)));
@@ -235,7 +238,7 @@ impl Handover {
     /// each camera seeing another target, and than any other reading of the same lines, unless that
     /// gives the same target.
     fn settle(&mut self, context: &ReadingContext<'_>) -> Vec<NewTrack> {
-        let ReadingContext { exposure, motion, .. } = *context;
+        let Comparison { exposure, motion, .. } = context.comparison;
         let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
         let all: Vec<&Reading> =
             self.seen.values().flatten().flat_map(|one| &one.readings).collect();

@@ -1,15 +1,13 @@
 //! A reading: one way in which cameras may have seen one target, one after another.
 
-use crossfix_filter::Gate;
 use crossfix_message::CameraName;
 
 use super::super::MAX_LINES;
 use super::super::one_target::{Mobility, OneTargetTest};
 use crate::cameras::{KnownCamera, view_sr};
-use crate::motion::MotionSetup;
+use crate::comparison::{Comparison, ComparisonRules};
 use crate::spatial::LineId;
 use crate::track::{FusedTrack, TrackBearing, TrackExpectation};
-use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
 /// Two cameras that have both seen something for longer than this, s, without a track coming of it,
@@ -20,23 +18,21 @@ pub(super) const TOGETHER_S: f64 = 1.0;
 /// Parameters from the site's configuration.
 #[derive(Debug)]
 pub(super) struct Rules {
+    pub(super) comparison: ComparisonRules,
     pub(super) tracking: Tracking,
-    pub(super) gate: Gate,
     /// Speed of targets, m/s, standard deviation per axis.
     pub(super) speed: f64,
     /// Sightings by two cameras up to this far apart count as simultaneous, s.
     pub(super) pair_s: f64,
-    pub(super) max_range_m: f64,
 }
 
 impl Rules {
     pub(super) fn new(config: &FusionConfig) -> Self {
         Self {
-            gate: Gate::with_probability(config.tracking.gate_probability),
+            comparison: ComparisonRules::new(config),
             tracking: config.tracking.clone(),
             speed: config.initiation.velocity_prior_sd_mps,
             pair_s: config.initiation.pair_s,
-            max_range_m: config.initiation.max_range_m,
         }
     }
 
@@ -47,28 +43,11 @@ impl Rules {
     }
 }
 
-/// The newest exposure with what its lines are compared by.
+/// The newest exposure, and whether each of its lines belongs to a track, by index.
 #[derive(Clone, Copy)]
 pub(super) struct ReadingContext<'a> {
-    pub(super) exposure: &'a Exposure,
-    pub(super) known: &'a KnownCamera,
-    pub(super) motion: &'a MotionSetup,
-    /// Whether a line belongs to a track, by index.
+    pub(super) comparison: Comparison<'a>,
     pub(super) is_owned: &'a [bool],
-}
-
-impl ReadingContext<'_> {
-    /// The uncertainty of the exposure's camera. The clock's error counts as noise: what it shifts
-    /// is not known before the velocity is.
-    pub(super) fn uncertainty(&self) -> CameraUncertainty {
-        CameraUncertainty { clock_is_noise: true, ..self.exposure.uncertainty }
-    }
-
-    /// The bearing of a track that is predicted for the exposure's camera.
-    pub(super) fn expectation(&self, track: &FusedTrack) -> Option<TrackExpectation> {
-        let (camera, origin) = (&self.exposure.camera, self.known.camera.pose().position());
-        track.expectation(self.exposure.time, camera, origin, &self.uncertainty(), self.motion)
-    }
 }
 
 /// What one camera has followed and other cameras may have seen since, taken for one target.
@@ -93,12 +72,12 @@ impl Reading {
         context: &ReadingContext<'_>,
         rules: &Rules,
     ) -> Option<Self> {
-        let ReadingContext { exposure, known, .. } = *context;
+        let Comparison { exposure, known, .. } = context.comparison;
         let line = &exposure.sightings[index].line;
         // Price of the velocity that the reading implies: v^2 / (2 sd^2), of a prior about zero.
         let unlikely = track.state().velocity().norm_squared() / (2.0 * rules.speed.powi(2));
-        let expected = context.expectation(&track)?;
-        let fit = expected.fit(line, rules.gate)?;
+        let expected = context.comparison.expectation(&track)?;
+        let fit = expected.fit(line, rules.comparison.gate)?;
         // Against one other target in the view: the line is there, so it is not weighed by P_D.
         let ratio = fit.log_ratio(1.0, rules.clutter_per_sr(known)) - unlikely;
         let mut reading =
@@ -110,26 +89,21 @@ impl Reading {
     /// Updates the reading with the exposure's best line; returns whether the reading is still
     /// open: not if that line belongs to a track.
     pub(super) fn advance(&mut self, context: &ReadingContext<'_>, rules: &Rules) -> bool {
-        let ReadingContext { exposure, known, is_owned, .. } = *context;
-        let Some(expected) = context.expectation(&self.track) else {
+        let ReadingContext { comparison, is_owned } = *context;
+        let Some(expected) = comparison.expectation(&self.track) else {
             return true;
         };
-        let lines = exposure.sightings.iter().enumerate().take(MAX_LINES);
-        let fits = lines.filter_map(|(i, sighting)| {
-            Some((expected.fit(&sighting.line, rules.gate)?.log_density, i))
-        });
-        let best = fits.max_by(|a, b| a.0.total_cmp(&b.0));
-        if let Some((log_density, index)) = best.filter(|(_, index)| !is_owned[*index]) {
-            self.take(
-                context,
-                index,
-                &expected,
-                log_density - rules.clutter_per_sr(known).ln(),
-                rules,
-            );
-        }
+        let near = comparison.candidates(&self.track, &expected, |index| index < MAX_LINES);
+        let Some(best) = near.max_by(|a, b| a.fit.log_density.total_cmp(&b.fit.log_density)) else {
+            return true;
+        };
         // Its best line belongs to a track: then so does the target, and the reading ends.
-        best.is_none_or(|(_, index)| !is_owned[index])
+        if is_owned[best.index] {
+            return false;
+        }
+        let ratio = best.fit.log_ratio(1.0, rules.clutter_per_sr(comparison.known));
+        self.take(context, best.index, &expected, ratio, rules);
+        true
     }
 
     /// Updates the reading with a line; `None` if the numbers fail.
@@ -141,20 +115,10 @@ impl Reading {
         first_ratio: f64,
         rules: &Rules,
     ) -> Option<()> {
-        let ReadingContext { exposure, motion, .. } = *context;
-        let Exposure { camera, time, sightings, .. } = exposure;
-        let line = &sightings[index].line;
-        let uncertainty = context.uncertainty();
-        let bearing = TrackBearing { uncertainty: &uncertainty, ..exposure.bearing(line) };
-        let density = motion.density(self.track.model_probabilities());
-        self.track.measurement_update(bearing, motion)?;
-        self.track.note_visibility(
-            camera,
-            *time,
-            true,
-            rules.tracking.detection_probability,
-            motion,
-        );
+        let comparison = context.comparison;
+        let bearing @ TrackBearing { camera, time, line, .. } = comparison.bearing(index);
+        let density = comparison.motion.density(self.track.model_probabilities());
+        comparison.take(&mut self.track, index)?;
         // If two other cameras see something at the same time, their agreement tells nothing about
         // what the first camera saw before.
         let is_joint = self.track.residuals.iter().any(|(name, residual)| {
@@ -172,7 +136,7 @@ impl Reading {
                 self.one_target.see_first(&bearing, rules.speed / range, first_ratio);
             }
         }
-        self.newest = LineId::new(exposure, index);
+        self.newest = LineId::new(comparison.exposure, index);
         Some(())
     }
 

@@ -11,6 +11,7 @@ use super::super::one_target::OneTargetTest;
 use super::super::sight::DirectionFilter;
 use super::Rules;
 use super::reading::{Reading, ReadingContext};
+use crate::comparison::Comparison;
 use crate::cueing::CueTarget;
 use crate::evidence::ONE_IN_A_HUNDRED;
 use crate::motion::MotionSetup;
@@ -71,7 +72,7 @@ impl SeenDirection {
             first: time,
             pose_variance: pose_variance(&line, exposure, index),
             line,
-            uncertainty: CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty },
+            uncertainty: exposure.uncertainty,
             score: 0.0,
             lines: 1.0,
             gaps: 0.0,
@@ -140,7 +141,7 @@ impl SeenDirection {
         context: &ReadingContext<'_>,
         rules: &Rules,
     ) -> Option<Reading> {
-        let ReadingContext { exposure, motion, .. } = *context;
+        let Comparison { exposure, motion, .. } = context.comparison;
         let line = &exposure.sightings[index].line;
         let track = self.placed(camera, line, exposure.time, rules, motion)?;
         let one_target = OneTargetTest::of_one(camera, self.sight.clone());
@@ -159,7 +160,7 @@ impl SeenDirection {
         motion: &MotionSetup,
     ) -> Option<FusedTrack> {
         let Self { sight, line: last, uncertainty, .. } = self;
-        let max_range_m = rules.max_range_m;
+        let max_range_m = rules.comparison.max_range_m;
         let by_now = Ray { origin: last.line.origin, direction: self.at(time).direction };
         let [range, there] = passing_ranges(by_now, line.ray());
         if ![range, there].iter().all(|range| (f64::MIN_POSITIVE..=max_range_m).contains(range)) {
