@@ -7,7 +7,7 @@ use crossfix_fusion::{Fusion, PoseFinding};
 use crossfix_message::{CameraName, Timestamp};
 
 /// Interval between checks, s of data time: a finding covers the last minute, and for 64 cameras it
-/// costs 0.1 s. With half of it that is spent twice as often; with twice as much a camera that was
+/// costs 25 ms. With half of it that is spent twice as often; with twice as much a camera that was
 /// moved is named up to ten seconds later.
 const ASKED_EVERY_S: f64 = 10.0;
 

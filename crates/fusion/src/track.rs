@@ -38,6 +38,7 @@ pub(crate) use expectation::TrackExpectation;
 use innovation::BearingInnovation;
 use learnt::Learnt;
 use past::PastState;
+pub(crate) use ties::Draw;
 use ties::Ties;
 
 /// A target that just two cameras see counts as placed if its position is known to this share of

@@ -10,13 +10,13 @@ use crossfix_filter::KinematicState;
 use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 
 use crate::cameras::{
-    Cameras, ClockChange, Fitting, Fittings, KnownCamera, Rooted, ScaleSample, ThirdDifferences,
+    Cameras, ClockChange, Fitting, Fittings, KnownCamera, Rooted, ThirdDifferences,
 };
 use crate::comparison::{Candidate, Comparison, ComparisonRules};
 use crate::cueing::CueTarget;
 use crate::motion::MotionSetup;
 use crate::reacquisition::{OwnedExposure, Reacquisition};
-use crate::track::{FusedTrack, TrackId, TrackStatus};
+use crate::track::{Draw, FusedTrack, TrackId, TrackStatus};
 
 use association::fitting;
 
@@ -315,13 +315,12 @@ impl Tracker {
 
     /// The cameras' mean offsets from confirmed targets, by target, for those whose comparison is
     /// due; each with the age of its track, s.
-    pub(crate) fn draws(&mut self) -> Vec<(f64, Vec<ScaleSample>)> {
+    pub(crate) fn draws(&mut self) -> Vec<Draw> {
         let sure = self
             .tracks
             .values_mut()
             .filter(|track| track.is_confirmed() && track.is_triangulated());
-        let drawn = sure.map(|track| (track.age_s(), track.draw()));
-        drawn.filter(|(_, samples)| samples.len() >= 2).collect()
+        sure.map(FusedTrack::draw).filter(|draw| draw.samples.len() >= 2).collect()
     }
 
     /// Passes on that a camera's pose error variance was found to be `ratio` times what was

@@ -16,6 +16,7 @@
 
 mod calibration;
 mod clutter;
+mod meeting;
 mod noise;
 mod pointing;
 mod pose_scale;

@@ -9,8 +9,9 @@
 //! of a careful survey. A clock that is off by more than its camera says looks like a pose that is.
 
 use crossfix_message::CameraName;
-use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Vector2};
 
+use super::meeting::Meeting;
 use super::{Cameras, NOTICED};
 
 /// Share of a draw in the running means, once there are enough. A draw lasts a third of a second:
@@ -41,9 +42,9 @@ const MAX_SCALE: f64 = 1e6;
 /// Largest factor (variance) on a pose that is declared. With half of it a camera that errs by
 /// twice what it declares is taken to err by 1.4 times that, and draws targets towards its lines.
 const MAX_DECLARED_SCALE: f64 = 4.0;
-/// A camera whose pose nobody has declared, and whose errors are more than this many times
-/// (variance) those of a careful survey, is doubted. With half of it one that errs by more than 2.1
-/// deviations is, and not only by more than 3.
+/// A camera whose pose's errors are more than this many times (variance) the declared ones, or
+/// those of a careful survey where nobody has declared any, is doubted. With half of it one that
+/// errs by more than 2.1 deviations is, and not only by more than 3.
 const DOUBTED: f64 = 9.0;
 
 /// What a camera has seen of a target during one draw.
@@ -80,6 +81,8 @@ struct SquaredPoseError {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PoseScale {
     value: f64,
+    /// What the chance that the camera has been moved adds to it ([`super::watch`]).
+    widened: f64,
     /// The factor as the tracks know it.
     told: f64,
     /// Least factor: a declared pose is not made better than it says.
@@ -97,7 +100,16 @@ impl PoseScale {
     pub(super) fn new(is_declared: bool) -> Self {
         let (least, greatest) =
             if is_declared { (1.0, MAX_DECLARED_SCALE) } else { (LEAST_SCALE, MAX_SCALE) };
-        Self { value: 1.0, told: 1.0, least, greatest, draws: 0.0, found: 0.0, expected: 0.0 }
+        Self {
+            value: 1.0,
+            widened: 0.0,
+            told: 1.0,
+            least,
+            greatest,
+            draws: 0.0,
+            found: 0.0,
+            expected: 0.0,
+        }
     }
 
     /// The factor on the pose's covariance, as the tracks know it.
@@ -105,7 +117,7 @@ impl PoseScale {
         self.told
     }
 
-    /// Whether the camera's lines miss the others' by far more than a careful survey leaves.
+    /// Whether the camera's lines miss the others' by far more than its pose explains.
     pub(super) fn is_doubted(&self) -> bool {
         self.told > DOUBTED
     }
@@ -144,9 +156,22 @@ impl PoseScale {
             self.found /= (next / self.value).max(1.0).sqrt();
         }
         self.value = next;
-        let ratio = self.value / self.told;
+        self.tell()
+    }
+
+    /// Widens the pose's covariance by what the chance that the camera has been moved adds to its
+    /// factor; returns by how much the tracks' factor changes, if it does.
+    pub(super) fn widen(&mut self, by: f64) -> Option<f64> {
+        self.widened = by;
+        self.tell()
+    }
+
+    /// The ratio by which the tracks' factor changes, if it does.
+    fn tell(&mut self) -> Option<f64> {
+        let factor = self.value + self.widened;
+        let ratio = factor / self.told;
         (ratio.ln().abs() > NOTICED).then(|| {
-            self.told = self.value;
+            self.told = factor;
             ratio
         })
     }
@@ -190,19 +215,9 @@ impl Cameras {
         let weight =
             |s: &ScaleSample| (s.noise + s.pose * s.pose.transpose() * scale(s)).try_inverse();
         let weights: Vec<Matrix2<f64>> = samples.iter().map(weight).collect::<Option<_>>()?;
-        let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
-        for (sample, weight) in samples.iter().zip(&weights) {
-            let weighed = sample.by_position.transpose() * weight;
-            information += weighed * sample.by_position;
-            pull += weighed * sample.residual;
-        }
-        // The weighted least-squares place (A' W A)^-1 A' W z, and P = W - W A (A' W A)^-1 A' W,
-        // which takes from a residual what the place has explained: REML.
-        let spread = information.try_inverse()?;
-        let place = spread * pull;
+        let meeting = Meeting::of(samples, &weights)?;
         let of_cameras = samples.iter().zip(&weights).map(|(sample, weight)| {
-            let SquaredPoseError { found, expected } =
-                sample.squared_error(weight, &place, &spread);
+            let SquaredPoseError { found, expected } = sample.squared_error(weight, &meeting);
             let scale = scale(sample);
             SquaredPoseError { found: found * scale, expected: expected * scale }
         });
@@ -218,16 +233,13 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 impl ScaleSample {
-    /// As [`Cameras::squared_errors`], for one camera with a factor of 1, given the best place and
-    /// its covariance.
-    fn squared_error(
-        &self,
-        weight: &Matrix2<f64>,
-        place: &Vector3<f64>,
-        spread: &Matrix3<f64>,
-    ) -> SquaredPoseError {
+    /// As [`Cameras::squared_errors`], for one camera with a factor of 1, given where the lines
+    /// meet.
+    fn squared_error(&self, weight: &Matrix2<f64>, meeting: &Meeting) -> SquaredPoseError {
+        let Meeting { place, spread, .. } = meeting;
         let Self { residual, by_position, pose, .. } = self;
-        // With pose root L and factor s: found s |L' W (z - A x)|^2, expected s tr(L' P L).
+        // With pose root L and factor s: found s |L' W (z - A x)|^2, expected s tr(L' P L), where
+        // P = W - W A (A' W A)^-1 A' W takes from a residual what the place has explained: REML.
         let error = pose.transpose() * weight * (residual - by_position * place);
         let told = weight - weight * by_position * spread * by_position.transpose() * weight;
         SquaredPoseError {

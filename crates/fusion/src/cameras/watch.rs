@@ -5,18 +5,22 @@
 //! one target miss each other, each with a prior as narrow as its calibration says. The error of a
 //! camera that somebody has turned is far larger than that: with a prior as wide as a knock for
 //! this camera alone, the lines become many times more likely. The estimated errors correct
-//! nothing; a new calibration does.
+//! nothing; a new calibration does. But a pose is only as sure as it is that nobody has moved its
+//! camera: what the chance of that adds to the pose's variance is passed on to the tracks.
 
+mod knock;
 mod memory;
 
 use std::collections::BTreeMap;
 
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{Matrix2, Matrix3, Matrix6, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix6, SMatrix, Unit, Vector3};
 
+use super::meeting::Meeting;
 use super::{Cameras, ScaleSample};
 use crate::evidence::ONE_IN_A_HUNDRED;
-use memory::{ErrorEstimate, Memory};
+use knock::{Knocks, Watched};
+use memory::Memory;
 
 /// Time constants of the memories, s in which targets are seen: a camera was moved that long ago,
 /// or longer, each as likely. A large turn shows in the shorter time, while most of the longer one
@@ -26,17 +30,6 @@ const MEMORIES_S: [f64; 2] = [20.0, 100.0];
 /// Longest time that counts between two successive draws, s: in a pause without a target nothing is
 /// learnt. With half of it the same: a draw lasts a third of a second.
 const LONGEST_DRAW_S: f64 = 1.0;
-/// Standard deviations of the turn of a camera that is moved, rad per axis, each as likely: a mast
-/// that settles, a gust, a hand, a fall. With the largest alone a turn of two milliradians would be
-/// less likely by a hundred times.
-const KNOCKS_RAD: [f64; 4] = [1e-3, 3e-3, 1e-2, 3e-2];
-/// Least deviation of a pose's rotation, rad: 0.1 mrad is what a mast does in the sun. With half of
-/// it the sun would move cameras whose pose is declared exact.
-const LEAST_TURN_RAD: f64 = 1e-4;
-/// Least deviation of its position, m. Where an exact pose is declared, nothing else would allow
-/// for the errors that a lens leaves; with half of it those of targets near the camera may count as
-/// a move.
-const LEAST_SHIFT_M: f64 = 2e-3;
 /// Degrees of freedom of Student's t: lines that miss each other by far more than anything explains
 /// are of two targets, and have the weight that this distribution gives them. With half of it such
 /// lines count a quarter less.
@@ -47,6 +40,10 @@ const FREEDOM: f64 = 4.0;
 /// stands where it stood. With clocks declared exact that were off by up to a tenth of a second, 39
 /// did. With half of it 30 times would do, against odds of a thousand.
 const SURE: f64 = 6.9;
+
+/// How often the chance that a camera has been moved is computed, s: 64 cameras cost 25 ms. With
+/// half of it twice that, and tracks say half a second earlier how unsure they are.
+const ASKED_EVERY_S: f64 = 1.0;
 
 /// Fewer cameras do not check one another: with two, an error in the plane of their sight lines
 /// shows in neither.
@@ -87,124 +84,22 @@ pub(super) struct ErrorWatch {
     cameras: Vec<Watched>,
     memories: [Memory; MEMORIES_S.len()],
     drawn: Option<Timestamp>,
-}
-
-#[derive(Clone, Debug)]
-struct Watched {
-    name: CameraName,
-    /// Covariance of the pose by its calibration, and a root of it.
-    covariance: Matrix6<f64>,
-    root: Matrix6<f64>,
-    watched_s: f64,
-    /// When the camera was last seen beside others.
-    drawn: Option<Timestamp>,
-}
-
-impl Watched {
-    fn new(name: CameraName, declared: &Matrix6<f64>) -> Self {
-        let mut covariance = *declared;
-        for axis in 0..3 {
-            covariance[(axis, axis)] += LEAST_TURN_RAD.powi(2);
-            covariance[(axis + 3, axis + 3)] += LEAST_SHIFT_M.powi(2);
-        }
-        let root = covariance.cholesky().map_or_else(Matrix6::identity, |factor| factor.l());
-        Self { name, covariance, root, watched_s: 0.0, drawn: None }
-    }
-
-    /// Notes that the camera has been seen beside others.
-    fn draw(&mut self, now: Timestamp) {
-        let last = self.drawn.replace(now);
-        self.watched_s +=
-            last.map_or(0.0, |last| now.seconds_since(last).clamp(0.0, LONGEST_DRAW_S));
-    }
-
-    /// Derivative of a line by the errors.
-    fn by_errors(&self, sample: &ScaleSample) -> SMatrix<f64, 2, ERRORS> {
-        let mut by = SMatrix::<f64, 2, ERRORS>::zeros();
-        // In units of the declared deviations: a pose error L s, with C = L L' and s of unit
-        // variance.
-        by.fixed_columns_mut::<6>(0).copy_from(&(sample.by_pose * self.root));
-        by.set_column(CLOCK, &sample.clock);
-        by
-    }
-
-    /// Inverse covariance of its errors if it has been knocked by `knock_rad`, rad.
-    fn knocked(&self, knock_rad: f64) -> Option<SMatrix<f64, ERRORS, ERRORS>> {
-        let mut wide = self.covariance;
-        // A knock turns the camera and leaves it in its place.
-        (0..3).for_each(|axis| wide[(axis, axis)] += knock_rad.powi(2));
-        let mut inverse = SMatrix::<f64, ERRORS, ERRORS>::identity();
-        // In units of the declared deviations: L' C^-1 L.
-        let own = self.root.transpose() * wide.cholesky()?.inverse() * self.root;
-        inverse.fixed_view_mut::<6, 6>(0, 0).copy_from(&own);
-        Some(inverse)
-    }
-
-    /// What the lines say of it, from the estimates of all errors if nothing has been moved; its
-    /// own errors begin at `first`.
-    fn found(&self, estimates: &[ErrorEstimate], first: usize) -> Option<PoseFinding> {
-        let mut each = Vec::with_capacity(KNOCKS_RAD.len() * estimates.len());
-        for ErrorEstimate { mean, covariance } in estimates {
-            let mean = mean.fixed_rows::<ERRORS>(first).into_owned();
-            let own = covariance.fixed_view::<ERRORS, ERRORS>(first, first).into_owned();
-            for knock_rad in KNOCKS_RAD {
-                each.push(self.found_knocked(knock_rad, &mean, &own)?);
-            }
-        }
-        let likeliest = each.iter().max_by(|a, b| a.log_odds.total_cmp(&b.log_odds))?;
-        // Mean of the likelihood ratios over all knocks and memories: each is as likely.
-        let odds = each.iter().map(|one| (one.log_odds - likeliest.log_odds).exp()).sum::<f64>();
-        let log_odds = likeliest.log_odds + (odds / each.len() as f64).ln();
-        Some(PoseFinding { log_odds, ..likeliest.clone() })
-    }
-
-    /// What the lines of one memory say, if the camera has been knocked by `knock_rad`, rad.
-    fn found_knocked(
-        &self,
-        knock_rad: f64,
-        mean: &SVector<f64, ERRORS>,
-        covariance: &SMatrix<f64, ERRORS, ERRORS>,
-    ) -> Option<PoseFinding> {
-        let prior = self.knocked(knock_rad)?;
-        // C^-1 = I + information of the lines, the other cameras' errors marginalised.
-        let known = covariance.cholesky()?.inverse();
-        // The posterior with the wide prior in place of the narrow one, which has unit variance.
-        let wide = (known - SMatrix::identity() + prior).cholesky()?;
-        let moved = wide.solve(&(known * mean));
-        // 2 ln odds = ln|P| - ln|C| - ln|A| + h' (x_wide - x), with the wide prior's precision P,
-        // the narrow posterior's covariance C, the wide posterior's precision A, and the lines'
-        // pull h on the errors.
-        let log_odds = (log_determinant(&prior.cholesky()?.l())
-            - log_determinant(&covariance.cholesky()?.l())
-            - log_determinant(&wide.l())
-            + (known * mean).dot(&(moved - mean)))
-            / 2.0;
-        // L is lower triangular: the rotation's rows have this block only.
-        let turns = self.root.fixed_view::<3, 3>(0, 0);
-        let spread: Matrix3<f64> =
-            turns * wide.inverse().fixed_view::<3, 3>(0, 0) * turns.transpose();
-        Some(PoseFinding {
-            watched_s: self.watched_s,
-            turn: turns * moved.fixed_rows::<3>(0),
-            turn_sd: spread.symmetric_eigenvalues().max().max(0.0).sqrt(),
-            log_odds,
-            is_moved: false,
-            or_else: Vec::new(),
-        })
-    }
-}
-
-/// Logarithm of the determinant of L L', from L.
-fn log_determinant(factor: &SMatrix<f64, ERRORS, ERRORS>) -> f64 {
-    2.0 * factor.diagonal().iter().map(|root| root.ln()).sum::<f64>()
+    /// When it was last computed who may have been moved.
+    asked: Option<Timestamp>,
 }
 
 impl ErrorWatch {
-    fn place_of(&mut self, name: &CameraName, declared: &Matrix6<f64>) -> usize {
+    /// Index of a camera, which looks `forward`, among those watched.
+    fn place_of(
+        &mut self,
+        name: &CameraName,
+        declared: &Matrix6<f64>,
+        forward: Unit<Vector3<f64>>,
+    ) -> usize {
         if let Some(place) = self.known(name) {
             return place;
         }
-        self.cameras.push(Watched::new(name.clone(), declared));
+        self.cameras.push(Watched::new(name.clone(), declared, forward));
         let errors = ERRORS * self.cameras.len();
         self.memories.iter_mut().for_each(|memory| memory.widen(errors));
         self.cameras.len() - 1
@@ -299,12 +194,38 @@ impl ErrorWatch {
         Some(())
     }
 
+    /// What the lines say of each camera if it has been moved.
+    fn knocks(&self) -> impl Iterator<Item = (&Watched, Knocks)> {
+        let estimates: Vec<_> = self.memories.iter().filter_map(Memory::estimate).collect();
+        self.cameras.iter().enumerate().filter_map(move |(place, camera)| {
+            Some((camera, camera.knocks(&estimates, ERRORS * place)?))
+        })
+    }
+
+    /// What the chance that a camera has been moved adds to the variance of its pose, in units of
+    /// the declared one. Each second moment counts with its probability: where the lines do not
+    /// tell which of two cameras it was, both are as unsure as that.
+    fn widenings(&self) -> Vec<(CameraName, f64)> {
+        let knocks: Vec<_> = self.knocks().collect();
+        // One camera has been moved, or none: P(k) = e^w_k / (1 + sum e^w), with w_k the log odds of
+        // the lines less the logarithm of the odds against it beforehand.
+        let weight = |own: &Knocks| own.log_odds - SURE;
+        let most = knocks.iter().map(|(_, own)| weight(own)).fold(0.0, f64::max);
+        let all =
+            knocks.iter().map(|(_, own)| (weight(own) - most).exp()).sum::<f64>() + (-most).exp();
+        let widened = knocks.iter().map(|(camera, own)| {
+            let log_probability = weight(own) - most - all.ln();
+            let is_possible = log_probability > ONE_IN_A_HUNDRED;
+            let by = if is_possible { log_probability.exp() * own.times_declared } else { 0.0 };
+            (camera.name.clone(), by)
+        });
+        widened.collect()
+    }
+
     /// What the lines say of each camera that has been watched.
     fn findings(&self) -> BTreeMap<CameraName, PoseFinding> {
-        let estimates: Vec<_> = self.memories.iter().filter_map(Memory::estimate).collect();
-        let found = self.cameras.iter().enumerate().filter_map(|(place, camera)| {
-            Some((camera.name.clone(), camera.found(&estimates, ERRORS * place)?))
-        });
+        let found =
+            self.knocks().map(|(camera, knocks)| (camera.name.clone(), camera.finding(&knocks)));
         let mut found: BTreeMap<CameraName, PoseFinding> = found.collect();
         let most = found.values().map(|own| own.log_odds).fold(f64::NEG_INFINITY, f64::max);
         // Every camera that explains the lines nearly as well as the likeliest one stays a suspect.
@@ -322,45 +243,34 @@ impl ErrorWatch {
     }
 }
 
-/// Where the sight lines of one target meet.
-struct Meeting {
-    place: Vector3<f64>,
-    /// Covariance of the place.
-    spread: Matrix3<f64>,
-    /// Sum of the squared residuals of the lines.
-    squares: f64,
-}
-
-impl Meeting {
-    /// Weighted least squares, with the inverse covariance of each line.
-    fn of(samples: &[ScaleSample], weights: &[Matrix2<f64>]) -> Option<Self> {
-        let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
-        for (sample, weight) in samples.iter().zip(weights) {
-            let weighed = sample.by_position.transpose() * weight;
-            information += weighed * sample.by_position;
-            pull += weighed * sample.residual;
-        }
-        let spread = information.try_inverse()?;
-        let place = spread * pull;
-        let squares = samples.iter().zip(weights).map(|(sample, weight)| {
-            let missed = sample.residual - sample.by_position * place;
-            missed.dot(&(weight * missed))
-        });
-        Some(Self { place, spread, squares: squares.sum() })
-    }
-}
-
 impl Cameras {
-    /// Takes in what cameras have seen of one target at a time.
-    pub(crate) fn watch(&mut self, samples: &[ScaleSample], now: Timestamp) {
+    /// Takes in what cameras have seen of one target at a time; returns the cameras whose pose's
+    /// factor has changed by that, each with the ratio.
+    pub(crate) fn watch(
+        &mut self,
+        samples: &[ScaleSample],
+        now: Timestamp,
+    ) -> Vec<(CameraName, f64)> {
         let Self { by_name, watch, .. } = self;
         watch.age(now);
         let mut places = Vec::with_capacity(samples.len());
         for sample in samples {
-            let Some(camera) = by_name.get(&sample.camera) else { return };
-            places.push(watch.place_of(&sample.camera, &camera.known().pose_covariance));
+            let Some(camera) = by_name.get(&sample.camera) else { return Vec::new() };
+            let known = camera.known();
+            let forward = Unit::new_normalize(known.camera.pose().rotation() * Vector3::z());
+            places.push(watch.place_of(&sample.camera, &known.pose_covariance, forward));
         }
         watch.learn(samples, &places, now);
+        let asked = *watch.asked.get_or_insert(now);
+        if now.seconds_since(asked).abs() < ASKED_EVERY_S {
+            return Vec::new();
+        }
+        watch.asked = Some(now);
+        let changed = watch.widenings().into_iter().filter_map(|(name, by)| {
+            let ratio = by_name.get_mut(&name)?.pose_scale.widen(by)?;
+            Some((name, ratio))
+        });
+        changed.collect()
     }
 
     /// What the lines say of each camera that has been watched beside others.
@@ -372,7 +282,7 @@ impl Cameras {
 #[cfg(test)]
 mod tests {
     use crossfix_geometry::BearingModel;
-    use nalgebra::{Point3, Vector2};
+    use nalgebra::{Matrix2, Point3, Vector2};
 
     use super::*;
 
@@ -408,8 +318,10 @@ mod tests {
             let (east, north) = ((0.2 * t).sin(), (0.3 * t).cos());
             let place = Point3::new(moves_m * east, moves_m * north, 25.0);
             let seen = samples(turn, place);
-            let places: Vec<usize> =
-                seen.iter().map(|one| watch.place_of(&one.camera, &declared)).collect();
+            let places: Vec<usize> = seen
+                .iter()
+                .map(|one| watch.place_of(&one.camera, &declared, Vector3::z_axis()))
+                .collect();
             watch.learn(&seen, &places, Timestamp::from_seconds(t)).unwrap();
         }
         watch

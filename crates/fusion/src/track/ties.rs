@@ -87,6 +87,18 @@ pub(super) struct Ties {
     steady: (Vector2<f64>, u32),
 }
 
+/// What the cameras have seen of a target, compared with its track.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Draw {
+    /// The age of the track, s.
+    pub(crate) age_s: f64,
+    /// The residuals of the cameras that see the target.
+    pub(crate) samples: Vec<ScaleSample>,
+    /// Those of the cameras that for long have had something beside it in the same place: that may
+    /// be the target.
+    pub(crate) beside: Vec<ScaleSample>,
+}
+
 /// A camera's bearings of the target since the last draw, summed: see `cameras/pose_scale.rs`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Drawn {
@@ -297,9 +309,9 @@ impl FusedTrack {
     /// If at least as many cameras as see the target have for long had something beside it in the
     /// same place, that is the target, and their poses are worse than stated: these residuals are
     /// then included.
-    pub(crate) fn draw(&mut self) -> Vec<ScaleSample> {
+    pub(crate) fn draw(&mut self) -> Draw {
         if self.updated_at.seconds_since(self.drawn) < DRAW_S {
-            return Vec::new();
+            return Draw::default();
         }
         self.drawn = self.updated_at;
         // The cameras see the target at different times within a draw: an uncertain velocity moves
@@ -314,9 +326,9 @@ impl FusedTrack {
             }
         }
         if beside.len() >= samples.len().max(LEAST_BESIDE) {
-            samples.extend(beside);
+            samples.append(&mut beside);
         }
-        samples
+        Draw { age_s: self.age_s(), samples, beside }
     }
 
     /// Passes on that a camera's pose error variances are `ratio` times what was assumed, and with

@@ -1,5 +1,7 @@
 //! What is remembered of the errors of all cameras.
 
+use faer::linalg::solvers::DenseSolveCore;
+use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
 use super::ERRORS;
@@ -64,7 +66,11 @@ impl Memory {
     /// The errors if no camera has been moved: their prior has unit variance.
     pub(super) fn estimate(&self) -> Option<ErrorEstimate> {
         let size = self.pull.len();
-        let factor = (&self.information + DMatrix::identity(size, size)).cholesky()?;
-        Some(ErrorEstimate { mean: factor.solve(&self.pull), covariance: factor.inverse() })
+        let prior = |row: usize, column: usize| if row == column { 1.0 } else { 0.0 };
+        // faer: of 64 cameras nalgebra's inverse takes four times as long.
+        let known = Mat::from_fn(size, size, |i, j| self.information[(i, j)] + prior(i, j));
+        let inverse = known.llt(Side::Lower).ok()?.inverse();
+        let covariance = DMatrix::from_fn(size, size, |i, j| inverse[(i, j)]);
+        Some(ErrorEstimate { mean: &covariance * &self.pull, covariance })
     }
 }
