@@ -362,6 +362,7 @@ impl<'a> Adjustment<'a> {
                 quadratic.add(&target, state.coefficients.len(), &seen, share * weight);
             }
         }
+        quadratic.information.fill_lower_triangle_with_upper_triangle();
         quadratic
     }
 
@@ -442,7 +443,8 @@ impl BearingResidual {
 }
 
 impl Quadratic {
-    /// Adds a bearing; the cameras' components come after the `points` ones of the trajectory.
+    /// Adds a bearing; the cameras' components come after the `points` ones of the trajectory. Of
+    /// the information, which is symmetric, the upper triangle alone: its columns are contiguous.
     fn add(
         &mut self,
         target: &PredictedTarget,
@@ -458,7 +460,7 @@ impl Quadratic {
             let row = 3 * (first + i);
             let mut part = self.gradient.fixed_rows_mut::<3>(row);
             part += pull * *a;
-            for (k, b) in place.iter().enumerate() {
+            for (k, b) in place.iter().enumerate().skip(i) {
                 let mut block = self.information.fixed_view_mut::<3, 3>(row, 3 * (first + k));
                 block += information * (a * b);
             }
@@ -466,16 +468,15 @@ impl Quadratic {
                 let tied = information * by * *a;
                 let mut beside = self.information.fixed_view_mut::<3, 1>(row, points + component);
                 beside += tied;
-                let mut below = self.information.fixed_view_mut::<1, 3>(points + component, row);
-                below += tied.transpose();
             }
         }
         // Each error of the camera moves the place by its shift: the cameras' columns of J.
-        for PlaceShift { component: one, by } in shifts {
-            self.gradient[points + one] += by.dot(&pull);
+        for (k, PlaceShift { component: other, by }) in shifts.iter().enumerate() {
+            self.gradient[points + other] += by.dot(&pull);
             let told = information * by;
-            for PlaceShift { component: other, by } in shifts {
-                self.information[(points + one, points + other)] += told.dot(by);
+            for PlaceShift { component: one, by } in &shifts[..=k] {
+                let [row, column] = [one.min(other), one.max(other)];
+                self.information[(points + row, points + column)] += told.dot(by);
             }
         }
     }
