@@ -143,13 +143,6 @@ impl AxisFilter {
         self.velocity_variance = rest + slope * self.cross;
     }
 
-    /// Multiplies the covariance by `factor`, where less is known than the filter believes.
-    pub fn inflate(&mut self, factor: f64) {
-        self.position_variance *= factor;
-        self.cross *= factor;
-        self.velocity_variance *= factor;
-    }
-
     /// Position, in the axis' unit.
     pub fn position(&self) -> f64 {
         self.position

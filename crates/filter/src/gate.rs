@@ -19,11 +19,6 @@ impl Gate {
         Self { threshold: -2.0 * (1.0 - p.clamp(0.0, 1.0 - 1e-12)).ln() }
     }
 
-    /// The gate with a given threshold `l^2` on the squared Mahalanobis distance.
-    pub fn with_threshold(threshold: f64) -> Self {
-        Self { threshold }
-    }
-
     /// The threshold `l^2`.
     pub fn threshold(&self) -> f64 {
         self.threshold
@@ -47,7 +42,8 @@ mod tests {
     #[test]
     fn probability_and_threshold_agree() {
         assert!((Gate::with_probability(0.95).threshold() - 5.991_464_547).abs() < 1e-8);
-        assert!((Gate::with_threshold(9.210_340_372).probability() - 0.99).abs() < 1e-10);
+        assert!((Gate::with_probability(0.99).threshold() - 9.210_340_372).abs() < 1e-8);
+        assert!((Gate::with_probability(0.99).probability() - 0.99).abs() < 1e-12);
         assert!(!Gate::with_probability(1.0).holds(f64::NAN));
     }
 }
