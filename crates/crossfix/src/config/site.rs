@@ -81,6 +81,8 @@ pub struct SiteFolder {
 pub struct CheckedCamera {
     pub path: PathBuf,
     pub camera: Camera,
+    /// Whether a mount turns it.
+    pub turns: bool,
     network: NetworkConfig,
 }
 
@@ -126,7 +128,8 @@ impl SiteFolder {
             file.name,
             file.network.display()
         );
-        let checked = CheckedCamera { path: path.to_owned(), camera, network };
+        let turns = file.mount.is_some();
+        let checked = CheckedCamera { path: path.to_owned(), camera, turns, network };
         if let Some(other) = self.cameras.insert(file.name.clone(), checked) {
             bail!(
                 "two cameras are called `{}`: change the key `name` of {} or of {}",

@@ -1,7 +1,11 @@
+mod views;
+
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::Context;
 use crossfix_geometry::Camera;
+use crossfix_message::CameraName;
 use crossfix_vision::TrackerConfig;
 use nalgebra::Vector3;
 
@@ -10,11 +14,13 @@ use crate::commands::examples;
 use crate::config::{self, CameraFile, FileKind, SiteFolder, load_network};
 use crate::output;
 use crate::parts;
+use views::View;
 
 /// Check configuration files before anything starts, and print what they resolve to.
 ///
 /// Videos are opened and compared with the intrinsics; of a folder, all files must fit together,
-/// and certificates that are there must be believed.
+/// and certificates that are there must be believed. Who sees nothing that another camera sees is
+/// named.
 #[derive(Debug, clap::Args)]
 #[command(after_help = examples(&[
     "crossfix check -c configs/site",
@@ -39,6 +45,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
                 view_of(&checked.camera)
             ));
         }
+        compare_views(&site);
         for path in &site.fusion {
             let verdict = if cfg!(feature = "centre") {
                 "is good"
@@ -115,6 +122,22 @@ fn check_camera(args: &Args) -> anyhow::Result<String> {
         tracing::info!("{}", parts::WITH_NASM);
     }
     Ok(toml::to_string(&file)?)
+}
+
+/// Prints how far apart the cameras stand, and warns of those that see nothing that another one
+/// sees.
+fn compare_views(site: &SiteFolder) {
+    let views: BTreeMap<&CameraName, View<'_>> = site
+        .cameras
+        .iter()
+        .map(|(name, checked)| (name, View { camera: &checked.camera, turns: checked.turns }))
+        .collect();
+    if let Some([least, most]) = views::distances_m(&views) {
+        output::line(format!("the cameras stand {least:.0} to {most:.0} m from one another"));
+    }
+    for name in views::alone(&views) {
+        tracing::warn!("camera `{name}` sees nothing that another camera sees: is its pose right?");
+    }
 }
 
 /// Where a camera stands and its direction of view, in words that let a person see whether the pose

@@ -1,0 +1,112 @@
+//! How the cameras of a site look at one another's views: what no other camera sees is never found.
+
+use std::collections::BTreeMap;
+
+use crossfix_geometry::{Camera, Pixel};
+use crossfix_message::CameraName;
+
+/// A view is compared at this many places along each side of the image. With half of it a view that
+/// crosses another one in a corner alone seems to cross none.
+const PLACES: u32 = 9;
+/// Ranges at which it is compared, m: from a few metres to the fusion's default of the largest
+/// range, each a fifth longer than the one before. With half as many, views that cross near the
+/// cameras alone seem to cross nowhere.
+const NEAREST_M: f64 = 5.0;
+const FARTHEST_M: f64 = 20_000.0;
+const STEP: f64 = 1.2;
+
+/// A camera by its name, as it is held against the others.
+pub(super) struct View<'a> {
+    pub(super) camera: &'a Camera,
+    /// Whether a mount turns it: then it may look anywhere.
+    pub(super) turns: bool,
+}
+
+/// The cameras that see nothing that another one sees.
+pub(super) fn alone<'a>(views: &BTreeMap<&'a CameraName, View<'_>>) -> Vec<&'a CameraName> {
+    let all = || views.iter().map(|(name, view)| (*name, view));
+    let is_alone = |&(name, view): &(&CameraName, &View<'_>)| {
+        let mut others = all().filter(|(other, _)| *other != name);
+        !view.turns && !others.any(|(_, other)| other.turns || crosses(view.camera, other.camera))
+    };
+    if views.len() < 2 {
+        return Vec::new();
+    }
+    all().filter(is_alone).map(|(name, _)| name).collect()
+}
+
+/// Whether another camera sees any of the places in a camera's view.
+fn crosses(camera: &Camera, other: &Camera) -> bool {
+    let size = camera.model().intrinsics().size;
+    let along = |side: u32, k: u32| f64::from(side - 1) * f64::from(k) / f64::from(PLACES - 1);
+    let pixels = (0..PLACES).flat_map(|x| (0..PLACES).map(move |y| (x, y)));
+    let pixels = pixels.map(|(x, y)| Pixel::new(along(size.width, x), along(size.height, y)));
+    let mut directions = pixels.filter_map(|pixel| camera.model().direction(pixel).ok());
+    let pose = camera.pose();
+    directions.any(|direction| {
+        let towards = pose.rotation() * direction.into_inner();
+        let ranges = std::iter::successors(Some(NEAREST_M), |range| Some(range * STEP));
+        let mut ranges = ranges.take_while(|range| *range < FARTHEST_M);
+        ranges.any(|range| other.sees(pose.position() + towards * range))
+    })
+}
+
+/// The least and the greatest distance of two of the cameras, m.
+pub(super) fn distances_m(views: &BTreeMap<&CameraName, View<'_>>) -> Option<[f64; 2]> {
+    let places: Vec<_> = views.values().map(|view| view.camera.pose().position()).collect();
+    let pairs = places.iter().enumerate();
+    let pairs = pairs.flat_map(|(k, one)| places[..k].iter().map(move |two| (one - two).norm()));
+    pairs.fold(None, |range: Option<[f64; 2]>, m| {
+        Some(range.map_or([m, m], |[least, most]| [least.min(m), most.max(m)]))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use crossfix_geometry::{Distortion, ImageSize, Intrinsics, Pose};
+    use nalgebra::Point3;
+
+    use super::*;
+
+    fn camera(at: [f64; 3], looking_at: [f64; 3]) -> Camera {
+        let size = ImageSize { width: 1280, height: 720 };
+        let distortion = Distortion::None;
+        let lens = Intrinsics { size, fx: 1000.0, fy: 1000.0, cx: 639.5, cy: 359.5, distortion };
+        let pose = Pose::looking_at(Point3::from(at), Point3::from(looking_at)).unwrap();
+        Camera::new(lens, pose).unwrap()
+    }
+
+    /// Who is alone, of cameras that stand and look there; those whose names begin with `t` turn.
+    fn alone_of(cameras: &[(&str, [f64; 3], [f64; 3])]) -> Vec<String> {
+        let known: Vec<(CameraName, Camera)> = cameras
+            .iter()
+            .map(|(name, at, looking_at)| (name.parse().unwrap(), camera(*at, *looking_at)))
+            .collect();
+        let views: BTreeMap<&CameraName, View<'_>> = known
+            .iter()
+            .map(|(name, camera)| (name, View { camera, turns: name.as_str().starts_with('t') }))
+            .collect();
+        alone(&views).into_iter().map(CameraName::to_string).collect()
+    }
+
+    #[test]
+    fn a_camera_that_faces_away_from_the_others_is_alone() {
+        let middle = [0.0, 0.0, 40.0];
+        let [east, west] =
+            [("east", [80.0, 0.0, 2.0], middle), ("west", [-80.0, 0.0, 2.0], middle)];
+        let away = ("north", [0.0, 90.0, 2.0], [0.0, 400.0, 20.0]);
+        assert_eq!(alone_of(&[east, west, ("north", [0.0, 90.0, 2.0], middle)]), [""; 0]);
+        assert_eq!(alone_of(&[east, west, away]), ["north"]);
+        // One that turns may look where the other looks.
+        assert_eq!(alone_of(&[("turning", west.1, west.2), away]), [""; 0]);
+        // A site of one camera is compared with nothing.
+        assert_eq!(alone_of(&[east]), [""; 0]);
+    }
+
+    #[test]
+    fn cameras_that_look_past_each_other_are_all_alone() {
+        let north = ("north", [-50.0, 0.0, 2.0], [-50.0, 100.0, 30.0]);
+        let south = ("south", [50.0, 0.0, 2.0], [50.0, -100.0, 30.0]);
+        assert_eq!(alone_of(&[north, south]), ["north", "south"]);
+    }
+}
