@@ -10,6 +10,7 @@ KIND is one of
   strangers  every tenth label is somewhere else in the image
   beside     labels wander about the drone by 3 px, for 60 frames at a time
   pose       every camera is turned by 3 mrad per axis, and stands 10 cm off
+  turned:NAME:MRAD  one camera is turned by so much about a random axis
 """
 import json
 import pathlib
@@ -48,24 +49,46 @@ def worse(labels, kind):
     return labels
 
 
-def turned(node):
-    """Poses that are off, wherever in the file they stand."""
+def turn(node, x, y, z):
+    """Turns a pose by a rotation vector in its camera's axes."""
+    angle = np.sqrt(x * x + y * y + z * z)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    # Rodrigues' formula.
+    by = np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
+    node["R_world_to_cam"] = (by @ np.array(node["R_world_to_cam"])).tolist()
+
+
+def poses(node, name=None):
+    """The names and poses of cameras, wherever in the file they stand."""
     if isinstance(node, dict) and "R_world_to_cam" in node:
-        x, y, z = RNG.normal(0, 3e-3, 3)
-        angle = np.sqrt(x * x + y * y + z * z)
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        # Rodrigues' formula.
-        turn = np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
-        node["R_world_to_cam"] = (turn @ np.array(node["R_world_to_cam"])).tolist()
-        node["centre_enu_m"] = (np.array(node["centre_enu_m"]) + RNG.normal(0, 0.1, 3)).tolist()
+        yield node.get("name", name), node
     elif isinstance(node, (dict, list)):
-        for part in node.values() if isinstance(node, dict) else node:
-            turned(part)
+        for name, part in node.items() if isinstance(node, dict) else ((name, part) for part in node):
+            yield from poses(part, name)
+
+
+def displace(file):
+    """All poses are off."""
+    for _, pose in poses(file):
+        turn(pose, *RNG.normal(0, 3e-3, 3))
+        pose["centre_enu_m"] = (np.array(pose["centre_enu_m"]) + RNG.normal(0, 0.1, 3)).tolist()
+
+
+def turn_one(file, name, mrad):
+    """One camera is turned by the same rotation in all its poses."""
+    axis = RNG.normal(size=3)
+    axis *= float(mrad) * 1e-3 / np.linalg.norm(axis)
+    of_name = [pose for other, pose in poses(file) if other == name]
+    if not of_name:
+        sys.exit(f"no camera is called {name}")
+    for pose in of_name:
+        turn(pose, *axis)
 
 
 def main():
     data, kind, folder = sys.argv[1:]
-    if kind not in __doc__.split():
+    kind, *of = kind.split(":")
+    if kind not in __doc__.replace(":", " ").split():
         sys.exit(f"{kind} is none of the kinds:\n{__doc__}")
     shutil.copytree(data, folder)
     for path in sorted(pathlib.Path(folder).glob("dataset*/detections/*.txt")):
@@ -73,11 +96,11 @@ def main():
         head = [line for line in lines[:1] if not line.strip()[0].isdigit()]
         labels = worse(np.array([line.split() for line in lines[len(head):]], dtype=float), kind)
         path.write_text("\n".join(head + [f"{n:.6f} {x:.8f} {y:.8f}" for n, x, y in labels]) + "\n")
-    if kind == "pose":
+    if kind in ("pose", "turned"):
         path = pathlib.Path(folder, "poses.json")
-        poses = json.loads(path.read_text())
-        turned(poses)
-        path.write_text(json.dumps(poses))
+        file = json.loads(path.read_text())
+        displace(file) if kind == "pose" else turn_one(file, *of)
+        path.write_text(json.dumps(file))
 
 
 main()
