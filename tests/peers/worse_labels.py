@@ -88,6 +88,8 @@ def turn_one(file, name, mrad):
 def main():
     data, kind, folder = sys.argv[1:]
     kind, *of = kind.split(":")
+    if len(of) != (2 if kind == "turned" else 0):
+        sys.exit(f"{sys.argv[2]} is none of the kinds:\n{__doc__}")
     if kind not in __doc__.replace(":", " ").split():
         sys.exit(f"{kind} is none of the kinds:\n{__doc__}")
     shutil.copytree(data, folder)

@@ -121,8 +121,6 @@ impl Drop for Draft {
         if let Some(part) = &self.part {
             drafts().remove(part);
             let _ = std::fs::remove_file(part);
-            // The error that ended it may not name the file: a full disk does not.
-            tracing::warn!("{} has not been written", self.path.display());
         }
     }
 }

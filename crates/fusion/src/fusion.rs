@@ -320,6 +320,7 @@ impl Fusion {
             self.clocks
                 .calibrate(&moved, self.cameras.known(&moved).map(|known| known.pose_covariance));
             self.initiator.forget(&moved);
+            self.tracker.forget_pose(&moved);
         }
         // Tracks first learn what has changed of the camera: the exposure is compared by what is
         // known now.
@@ -398,8 +399,8 @@ impl Fusion {
                 changed = self.cameras.learn_poses(&samples);
             }
             // Where three others see the target, it is for them to accuse who sees something beside
-            // it; where two do, any of the three may have been moved.
-            if samples.len() < 3 {
+            // it; where two do, however new their track is, any of the three may have been moved.
+            if samples.len() == 2 {
                 samples.append(&mut beside);
             }
             if samples.len() >= least {

@@ -262,6 +262,7 @@ impl Tracker {
         for ids in self.in_order_of_choice() {
             self.associate(exposure, known, &ids, &mut owners, &mut noted);
         }
+        self.note_beside(exposure, known, &owners);
         let Noted { mut changes, fittings, third_differences } = noted;
         self.reacquire(exposure, known, &mut owners);
         let used = owners
@@ -313,8 +314,8 @@ impl Tracker {
         Some(if is_alone { Fitting::Beside } else { Fitting::Fits })
     }
 
-    /// The cameras' mean offsets from confirmed targets, by target, for those whose comparison is
-    /// due; each with the age of its track, s.
+    /// What the cameras see of confirmed targets and beside them, by target, for those whose
+    /// comparison is due.
     pub(crate) fn draws(&mut self) -> Vec<Draw> {
         let sure = self
             .tracks
@@ -327,6 +328,11 @@ impl Tracker {
     /// assumed.
     pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
         self.tracks.values_mut().for_each(|track| track.rescale_pose(camera, ratio));
+    }
+
+    /// Passes on that a camera has been calibrated anew: see [`FusedTrack::forget_pose`].
+    pub(crate) fn forget_pose(&mut self, camera: &CameraName) {
+        self.tracks.values_mut().for_each(|track| track.forget_pose(camera));
     }
 
     /// Passes on that a camera's mount has turned it: see [`FusedTrack::turn_camera`].

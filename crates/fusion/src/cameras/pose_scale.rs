@@ -77,12 +77,21 @@ struct SquaredPoseError {
     expected: f64,
 }
 
+/// The chance that a camera has been moved.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Moved {
+    /// Its probability.
+    pub(super) probability: f64,
+    /// The factor on the covariance of its pose, if it has been moved.
+    pub(super) factor: f64,
+}
+
 /// Factor on a camera's pose covariance, and what it is learnt from.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PoseScale {
     value: f64,
-    /// What the chance that the camera has been moved adds to it ([`super::watch`]).
-    widened: f64,
+    /// The chance that the camera has been moved ([`super::watch`]).
+    moved: Moved,
     /// The factor as the tracks know it.
     told: f64,
     /// Least factor: a declared pose is not made better than it says.
@@ -102,7 +111,7 @@ impl PoseScale {
             if is_declared { (1.0, MAX_DECLARED_SCALE) } else { (LEAST_SCALE, MAX_SCALE) };
         Self {
             value: 1.0,
-            widened: 0.0,
+            moved: Moved::default(),
             told: 1.0,
             least,
             greatest,
@@ -117,9 +126,10 @@ impl PoseScale {
         self.told
     }
 
-    /// Whether the camera's lines miss the others' by far more than its pose explains.
+    /// Whether the camera's lines miss the others' by far more than its pose explains, or it is
+    /// likelier to have been moved than not.
     pub(super) fn is_doubted(&self) -> bool {
-        self.told > DOUBTED
+        self.value > DOUBTED || self.moved.probability > 0.5
     }
 
     /// The step that the camera's own draws alone would take: its factor's ratio to that before.
@@ -159,16 +169,19 @@ impl PoseScale {
         self.tell()
     }
 
-    /// Widens the pose's covariance by what the chance that the camera has been moved adds to its
-    /// factor; returns by how much the tracks' factor changes, if it does.
-    pub(super) fn widen(&mut self, by: f64) -> Option<f64> {
-        self.widened = by;
+    /// Takes in the chance that the camera has been moved; returns by how much the tracks' factor
+    /// changes, if it does.
+    pub(super) fn doubt(&mut self, moved: Moved) -> Option<f64> {
+        self.moved = moved;
         self.tell()
     }
 
     /// The ratio by which the tracks' factor changes, if it does.
     fn tell(&mut self) -> Option<f64> {
-        let factor = self.value + self.widened;
+        // Second moment of a mixture, (1 - P) s + P m; where m is no larger than s, the errors are
+        // no news.
+        let Moved { probability, factor } = self.moved;
+        let factor = self.value + probability * (factor - self.value).max(0.0);
         let ratio = factor / self.told;
         (ratio.ln().abs() > NOTICED).then(|| {
             self.told = factor;

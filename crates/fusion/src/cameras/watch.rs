@@ -17,6 +17,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix6, SMatrix, Unit, Vector3};
 
 use super::meeting::Meeting;
+use super::pose_scale::Moved;
 use super::{Cameras, ScaleSample};
 use crate::evidence::ONE_IN_A_HUNDRED;
 use knock::{Knocks, Watched};
@@ -41,8 +42,9 @@ const FREEDOM: f64 = 4.0;
 /// did. With half of it 30 times would do, against odds of a thousand.
 const SURE: f64 = 6.9;
 
-/// How often the chance that a camera has been moved is computed, s: 64 cameras cost 25 ms. With
-/// half of it twice that, and tracks say half a second earlier how unsure they are.
+/// How often the chance that a camera has been moved is computed, s: 64 cameras cost 25 ms, and the
+/// cost grows with the third power. With half of it twice that, and tracks say half a second earlier
+/// how unsure they are.
 const ASKED_EVERY_S: f64 = 1.0;
 
 /// Fewer cameras do not check one another: with two, an error in the plane of their sight lines
@@ -188,6 +190,9 @@ impl ErrorWatch {
                 }
             }
         }
+        for (sample, place) in samples.iter().zip(places) {
+            self.cameras[*place].see(sample);
+        }
         if places.len() >= LEAST_TOGETHER {
             places.iter().for_each(|place| self.cameras[*place].draw(now));
         }
@@ -202,10 +207,9 @@ impl ErrorWatch {
         })
     }
 
-    /// What the chance that a camera has been moved adds to the variance of its pose, in units of
-    /// the declared one. Each second moment counts with its probability: where the lines do not
-    /// tell which of two cameras it was, both are as unsure as that.
-    fn widenings(&self) -> Vec<(CameraName, f64)> {
+    /// The chance that each camera has been moved. Where the lines do not tell which of two cameras
+    /// it was, it is even.
+    fn chances(&self) -> Vec<(CameraName, Moved)> {
         let knocks: Vec<_> = self.knocks().collect();
         // One camera has been moved, or none: P(k) = e^w_k / (1 + sum e^w), with w_k the log odds of
         // the lines less the logarithm of the odds against it beforehand.
@@ -213,13 +217,14 @@ impl ErrorWatch {
         let most = knocks.iter().map(|(_, own)| weight(own)).fold(0.0, f64::max);
         let all =
             knocks.iter().map(|(_, own)| (weight(own) - most).exp()).sum::<f64>() + (-most).exp();
-        let widened = knocks.iter().map(|(camera, own)| {
+        let chances = knocks.iter().map(|(camera, own)| {
             let log_probability = weight(own) - most - all.ln();
+            // What is less likely than one in a hundred counts as none.
             let is_possible = log_probability > ONE_IN_A_HUNDRED;
-            let by = if is_possible { log_probability.exp() * own.times_declared } else { 0.0 };
-            (camera.name.clone(), by)
+            let probability = if is_possible { log_probability.exp() } else { 0.0 };
+            (camera.name.clone(), Moved { probability, factor: own.factor })
         });
-        widened.collect()
+        chances.collect()
     }
 
     /// What the lines say of each camera that has been watched.
@@ -266,8 +271,8 @@ impl Cameras {
             return Vec::new();
         }
         watch.asked = Some(now);
-        let changed = watch.widenings().into_iter().filter_map(|(name, by)| {
-            let ratio = by_name.get_mut(&name)?.pose_scale.widen(by)?;
+        let changed = watch.chances().into_iter().filter_map(|(name, moved)| {
+            let ratio = by_name.get_mut(&name)?.pose_scale.doubt(moved)?;
             Some((name, ratio))
         });
         changed.collect()
@@ -342,6 +347,28 @@ mod tests {
         let found = watch.findings();
         assert!(!found.contains_key(&name));
         assert!(found.values().all(|own| !own.is_moved) && found.len() == 1, "{found:?}");
+    }
+
+    /// The probability that each of the two cameras has been moved.
+    fn chances(watch: &ErrorWatch) -> [f64; 2] {
+        let chances = watch.chances();
+        ["a", "b"]
+            .map(|name| chances.iter().find(|one| one.0.as_str() == name).unwrap().1.probability)
+    }
+
+    #[test]
+    fn the_chance_of_a_move_is_none_where_none_is_turned_and_shared_where_either_may_be() {
+        assert_eq!(chances(&watched(Vector3::zeros(), 20.0)), [0.0; 2]);
+        let mut either = watched(Vector3::new(0.0, 0.04, 0.0), 0.0);
+        let [a, b] = chances(&either);
+        assert!((a + b - 1.0).abs() < 1e-6 && a.min(b) > 0.05, "{a} {b}");
+        let [a, b] = chances(&watched(Vector3::new(5e-3, 0.0, 0.0), 20.0));
+        assert!(a > 0.99 && b < 0.01, "{a} {b}");
+        // What was seen long ago fades, by the time in which targets were seen.
+        for k in 0..3000 {
+            either.age(Timestamp::from_seconds(60.0 + 0.3 * f64::from(k)));
+        }
+        assert_eq!(chances(&either), [0.0; 2]);
     }
 
     #[test]

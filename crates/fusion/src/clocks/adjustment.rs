@@ -444,7 +444,8 @@ impl BearingResidual {
 
 impl Quadratic {
     /// Adds a bearing; the cameras' components come after the `points` ones of the trajectory. Of
-    /// the information, which is symmetric, the upper triangle alone: its columns are contiguous.
+    /// the information, which is symmetric, the upper triangle alone: there a component's ties to
+    /// the trajectory lie in one column.
     fn add(
         &mut self,
         target: &PredictedTarget,

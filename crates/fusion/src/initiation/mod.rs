@@ -138,8 +138,8 @@ impl Initiator {
     }
 }
 
-/// The exposure for targets whose velocity is hardly known, and with it what the clock's error
-/// shifts: that counts as noise of each bearing.
+/// The exposure for targets whose velocity is hardly known. Its clock's error counts as noise of
+/// each bearing: what it shifts is not known before the velocity is.
 fn of_unknown_velocity(mut exposure: Exposure) -> Exposure {
     exposure.uncertainty.clock_is_noise = true;
     exposure

@@ -58,8 +58,8 @@ const STEADY: f64 = 0.2;
 /// same direction is taken for the target. With half of the share, the track's own wander ends the
 /// row.
 const STEADY_DRAWS: u32 = 5;
-/// At least this many cameras must have it beside the target: a single one (half of it) may be
-/// turned, and it is for the others to accuse it.
+/// At least this many cameras must have it beside the target for the size of their errors to be
+/// learnt from it: a single one (half of it) may be turned, which the watch for moved cameras finds.
 const LEAST_BESIDE: usize = 2;
 
 /// The ties of a track to one camera that has seen it, and how that camera sees the target.
@@ -338,6 +338,12 @@ impl FusedTrack {
         if let Some(change) = self.rescale::<OF_POSE>(camera, 0, rescaling) {
             self.imm.add_covariance(&change);
         }
+    }
+
+    /// Passes on that a camera has been calibrated anew: the error of its pose is another one, of
+    /// which the track contains nothing.
+    pub(crate) fn forget_pose(&mut self, camera: &CameraName) {
+        self.rescale::<OF_POSE>(camera, 0, Rescaling { ratio: 1.0, scale: 0.0 });
     }
 
     /// Passes on what has been learnt of a camera's clock: it is `ahead` (in its standard

@@ -6,7 +6,7 @@ use crossfix_message::TrackEventKind;
 
 use super::{Noted, TrackChange, Tracker};
 use crate::assignment::{Pairing, assign};
-use crate::cameras::{Fitting, KnownCamera};
+use crate::cameras::{Fitting, KnownCamera, Rooted};
 use crate::comparison::{Candidate, Comparison};
 use crate::evidence::BEYOND_DOUBT;
 use crate::track::{FusedTrack, TrackId, TrackStatus};
@@ -68,9 +68,6 @@ impl Tracker {
             });
             let gain = taken.and(column).and_then(|column| gains.get(&(row, column))).copied();
             let sees = comparison.expects(track);
-            if sure && taken.is_none() && track.is_triangulated() {
-                note_beside(track, exposure, known);
-            }
             if sure && (taken.is_some() || sees) {
                 let others = track.others_than(&exposure.camera);
                 noted.fittings.add(others, fitting(track, exposure, known, taken.is_some()));
@@ -87,6 +84,32 @@ impl Tracker {
             }
             if taken.is_some_and(|taken| taken.manoeuvre) {
                 noted.changes.push(TrackChange::new(TrackEventKind::Manoeuvre, *id));
+            }
+        }
+    }
+
+    /// Notes beside each track that several cameras support, and of which the exposure has no
+    /// bearing, the line that passes nearest to it: of those that are no track's, and that something
+    /// gives which moves. What stands in the view is not the target seen by a turned camera.
+    pub(super) fn note_beside(
+        &mut self,
+        exposure: &Exposure,
+        known: &KnownCamera,
+        owners: &[Option<TrackId>],
+    ) {
+        let free = exposure.sightings.iter().zip(owners);
+        let free =
+            free.filter(|(sighting, owner)| owner.is_none() && sighting.rooted == Rooted::No);
+        let free: Vec<&Sighting> = free.map(|(sighting, _)| sighting).collect();
+        let tracks = self.tracks.iter_mut().filter(|(id, track)| {
+            track.is_confirmed() && track.is_triangulated() && !owners.contains(&Some(**id))
+        });
+        for (_, track) in tracks {
+            let expected = track.position_at(exposure.time) - known.camera.pose().position();
+            let away = |sighting: &Sighting| sighting.line.direction.angle(&expected);
+            let beside = free.iter().filter(|sighting| away(sighting) < BESIDE_RAD);
+            if let Some(nearest) = beside.min_by(|one, other| away(one).total_cmp(&away(other))) {
+                track.gather_beside(&exposure.bearing(&nearest.line));
             }
         }
     }
@@ -165,16 +188,6 @@ impl Evidence {
             None if self.sees && !silent && seen_since => missed,
             None => 0.0,
         }
-    }
-}
-
-/// Notes the line that passes nearest to a track, for an exposure that has no bearing of it.
-fn note_beside(track: &mut FusedTrack, exposure: &Exposure, known: &KnownCamera) {
-    let expected = track.position_at(exposure.time) - known.camera.pose().position();
-    let away = |sighting: &Sighting| sighting.line.direction.angle(&expected);
-    let beside = exposure.sightings.iter().filter(|sighting| away(sighting) < BESIDE_RAD);
-    if let Some(nearest) = beside.min_by(|one, other| away(one).total_cmp(&away(other))) {
-        track.gather_beside(&exposure.bearing(&nearest.line));
     }
 }
 

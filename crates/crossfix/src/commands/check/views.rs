@@ -8,12 +8,11 @@ use crossfix_message::CameraName;
 /// A view is compared at this many places along each side of the image. With half of it a view that
 /// crosses another one in a corner alone seems to cross none.
 const PLACES: u32 = 9;
-/// Ranges at which it is compared, m: from a few metres to the fusion's default of the largest
-/// range, each a fifth longer than the one before. With half as many, views that cross near the
-/// cameras alone seem to cross nowhere.
+/// Nearest range at which it is compared, m. With half of it the same: nobody sees targets there.
 const NEAREST_M: f64 = 5.0;
+/// Farthest range, m: the fusion's default of the largest one. With half of it cameras whose views
+/// cross beyond ten kilometres seem to be alone.
 const FARTHEST_M: f64 = 20_000.0;
-const STEP: f64 = 1.2;
 
 /// A camera by its name, as it is held against the others.
 pub(super) struct View<'a> {
@@ -27,7 +26,7 @@ pub(super) fn alone<'a>(views: &BTreeMap<&'a CameraName, View<'_>>) -> Vec<&'a C
     let all = || views.iter().map(|(name, view)| (*name, view));
     let is_alone = |&(name, view): &(&CameraName, &View<'_>)| {
         let mut others = all().filter(|(other, _)| *other != name);
-        !view.turns && !others.any(|(_, other)| other.turns || crosses(view.camera, other.camera))
+        !view.turns && !others.any(|(_, other)| other.turns || cross(view.camera, other.camera))
     };
     if views.len() < 2 {
         return Vec::new();
@@ -35,8 +34,19 @@ pub(super) fn alone<'a>(views: &BTreeMap<&'a CameraName, View<'_>>) -> Vec<&'a C
     all().filter(is_alone).map(|(name, _)| name).collect()
 }
 
-/// Whether another camera sees any of the places in a camera's view.
-fn crosses(camera: &Camera, other: &Camera) -> bool {
+/// Whether one of two cameras sees any of the places in the other's view: a narrow view lies between
+/// the places of a wide one.
+fn cross(one: &Camera, other: &Camera) -> bool {
+    sees_any(one, other) || sees_any(other, one)
+}
+
+/// Whether a camera sees any of the places in another one's view.
+fn sees_any(other: &Camera, camera: &Camera) -> bool {
+    let lens = other.model().intrinsics();
+    let narrower =
+        (f64::from(lens.size.width) / lens.fx).min(f64::from(lens.size.height) / lens.fy);
+    // From range to range by half of the other's narrower view, so that it lies between no two.
+    let step = 1.0 + (narrower / 2.0).clamp(1e-3, 0.2);
     let size = camera.model().intrinsics().size;
     let along = |side: u32, k: u32| f64::from(side - 1) * f64::from(k) / f64::from(PLACES - 1);
     let pixels = (0..PLACES).flat_map(|x| (0..PLACES).map(move |y| (x, y)));
@@ -45,7 +55,7 @@ fn crosses(camera: &Camera, other: &Camera) -> bool {
     let pose = camera.pose();
     directions.any(|direction| {
         let towards = pose.rotation() * direction.into_inner();
-        let ranges = std::iter::successors(Some(NEAREST_M), |range| Some(range * STEP));
+        let ranges = std::iter::successors(Some(NEAREST_M), |range| Some(range * step));
         let mut ranges = ranges.take_while(|range| *range < FARTHEST_M);
         ranges.any(|range| other.sees(pose.position() + towards * range))
     })
@@ -69,9 +79,14 @@ mod tests {
     use super::*;
 
     fn camera(at: [f64; 3], looking_at: [f64; 3]) -> Camera {
+        camera_with(1000.0, at, looking_at)
+    }
+
+    /// A camera whose focal length is `f` (px).
+    fn camera_with(f: f64, at: [f64; 3], looking_at: [f64; 3]) -> Camera {
         let size = ImageSize { width: 1280, height: 720 };
         let distortion = Distortion::None;
-        let lens = Intrinsics { size, fx: 1000.0, fy: 1000.0, cx: 639.5, cy: 359.5, distortion };
+        let lens = Intrinsics { size, fx: f, fy: f, cx: 639.5, cy: 359.5, distortion };
         let pose = Pose::looking_at(Point3::from(at), Point3::from(looking_at)).unwrap();
         Camera::new(lens, pose).unwrap()
     }
@@ -101,6 +116,18 @@ mod tests {
         assert_eq!(alone_of(&[("turning", west.1, west.2), away]), [""; 0]);
         // A site of one camera is compared with nothing.
         assert_eq!(alone_of(&[east]), [""; 0]);
+    }
+
+    /// Views of 5 degrees lie between the places and ranges of a coarse comparison.
+    #[test]
+    fn narrow_views_that_cross_are_seen_to_cross() {
+        let far = [313.0, 77.0, 41.0];
+        let narrow = camera_with(14_000.0, [0.0, 0.0, 2.0], far);
+        let across = camera_with(14_000.0, [313.0, -400.0, 2.0], far);
+        let wide = camera([250.0, -100.0, 2.0], far);
+        assert!(cross(&narrow, &across) && cross(&narrow, &wide) && cross(&wide, &narrow));
+        let past = camera_with(14_000.0, [0.0, 0.0, 2.0], [313.0, 177.0, 41.0]);
+        assert!(!cross(&past, &across));
     }
 
     #[test]

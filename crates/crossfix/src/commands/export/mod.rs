@@ -84,7 +84,7 @@ fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
     let draft = Draft::new(csv, &inputs)?;
     let cannot_write = || format!("cannot write {}", csv.display());
     let mut table = TrackTable::create(draft.path()).with_context(cannot_write)?;
-    table.writer.write_record(COLUMNS)?;
+    table.writer.write_record(COLUMNS).with_context(cannot_write)?;
     let at = |time| if args.all { history.all_at(time) } else { history.at(time) };
     match &args.times {
         Some(path) => {
@@ -94,12 +94,12 @@ fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
                 let TimeRow { t } =
                     row.with_context(|| format!("{} needs a column `t`", path.display()))?;
                 ensure!(t.is_finite(), "{}: a time is {t}", path.display());
-                table.write(t, &at(Timestamp::from_seconds(t)))?;
+                table.write(t, &at(Timestamp::from_seconds(t))).with_context(cannot_write)?;
             }
         }
         None => {
             for time in history.times() {
-                table.write(time.seconds(), &at(time))?;
+                table.write(time.seconds(), &at(time)).with_context(cannot_write)?;
             }
         }
     }

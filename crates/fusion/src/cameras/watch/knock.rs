@@ -26,6 +26,9 @@ pub(super) struct Watched {
     /// Covariance of the pose by its calibration, and a root of it.
     covariance: Matrix6<f64>,
     root: Matrix6<f64>,
+    /// Mean square of the shift of its newest line by the declared error of its pose, rad^2 per
+    /// tangent.
+    declared_rad2: f64,
     /// The direction in which it looks.
     forward: Unit<Vector3<f64>>,
     pub(super) watched_s: f64,
@@ -46,7 +49,7 @@ impl Watched {
             covariance[(axis + 3, axis + 3)] += LEAST_SHIFT_M.powi(2);
         }
         let root = covariance.cholesky().map_or_else(Matrix6::identity, |factor| factor.l());
-        Self { name, covariance, root, forward, watched_s: 0.0, drawn: None }
+        Self { name, covariance, root, declared_rad2: 0.0, forward, watched_s: 0.0, drawn: None }
     }
 
     /// Notes that the camera has been seen beside others.
@@ -94,16 +97,20 @@ impl Watched {
         let ratio = |one: &Knock| (one.log_odds - likeliest.log_odds).exp();
         let odds: f64 = each.iter().map(ratio).sum();
         let log_odds = likeliest.log_odds + (odds / each.len() as f64).ln();
-        let squares = each.iter().map(|one| one.squares() * (ratio(one) / odds)).sum();
-        let declared = self.covariance.fixed_view::<3, 3>(0, 0).into_owned();
-        let times_declared = self.across(&squares) / self.across(&declared);
-        Some(Knocks { likeliest, log_odds, times_declared })
+        let squares: Matrix3<f64> =
+            each.iter().map(|one| one.squares() * (ratio(one) / odds)).sum();
+        // Turned about the direction in which it looks, it sees the same; about each of the two
+        // axes across that, its lines are shifted along one tangent.
+        let along = self.forward.dot(&(squares * self.forward.into_inner()));
+        let moved_rad2 = (squares.trace() - along) / 2.0;
+        // A pose that is declared exact stays so, whatever the factor.
+        let factor = moved_rad2 / self.declared_rad2.max(LEAST_TURN_RAD.powi(2));
+        Some(Knocks { likeliest, log_odds, factor })
     }
 
-    /// The part of the squares of turns (rad^2, about the world's axes) that is about the axes
-    /// across its view: turned about the direction in which it looks, it sees the same.
-    fn across(&self, squares: &Matrix3<f64>) -> f64 {
-        squares.trace() - self.forward.dot(&(squares * self.forward.into_inner()))
+    /// Notes a line that is compared with others'.
+    pub(super) fn see(&mut self, sample: &ScaleSample) {
+        self.declared_rad2 = sample.pose.norm_squared() / 2.0;
     }
 
     /// The finding if it has been moved.
@@ -165,13 +172,14 @@ impl Knock {
     }
 }
 
-/// The same for all sizes.
+/// The same over all sizes and memories.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Knocks {
     likeliest: Knock,
     pub(super) log_odds: f64,
-    /// Mean square of its turn across its view, in units of what is declared.
-    pub(super) times_declared: f64,
+    /// Factor on the covariance of its pose: how many times the declared one its lines are shifted,
+    /// in the mean square.
+    pub(super) factor: f64,
 }
 
 /// Logarithm of the determinant of L L', from L.
