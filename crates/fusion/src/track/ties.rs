@@ -81,8 +81,10 @@ pub(super) struct Ties {
     period_s: Option<f64>,
     pub(super) recent: RecentBearings,
     pub(super) drawn: Option<Drawn>,
-    /// The same for what it has seen beside the target, when it has not seen the target itself.
+    /// The same for what it has seen beside the target, when it has not seen the target itself, ...
     beside: Option<Drawn>,
+    /// ... and whether all of that may be the target, as a camera that is turned sees it.
+    may_be_it: bool,
     /// The residual of that in the last draw (rad), and for how many draws it has stayed there.
     steady: (Vector2<f64>, u32),
 }
@@ -191,6 +193,7 @@ impl Ties {
             recent: RecentBearings::default(),
             drawn: None,
             beside: None,
+            may_be_it: true,
             steady: (Vector2::zeros(), 0),
         }
     }
@@ -296,12 +299,13 @@ impl FusedTrack {
     }
 
     /// Adds a bearing that passes beside the target to the next draw, for an exposure that has none
-    /// of the target.
-    pub(crate) fn gather_beside(&mut self, bearing: &TrackBearing<'_>) {
+    /// of the target; whether it may be the target's, if the camera is turned.
+    pub(crate) fn gather_beside(&mut self, bearing: &TrackBearing<'_>, may_be_it: bool) {
         let velocity = self.state().velocity();
         let innovation = self.innovation(bearing.time, bearing.line);
         if let (Some(innovation), Some(ties)) = (innovation, self.ties.get_mut(bearing.camera)) {
             ties.beside = Some(Drawn::with(ties.beside, &innovation, velocity, bearing));
+            ties.may_be_it &= may_be_it;
         }
     }
 
@@ -320,14 +324,19 @@ impl FusedTrack {
         let (mut samples, mut beside) = (Vec::new(), Vec::new());
         for (camera, ties) in &mut self.ties {
             let steady = ties.steady_beside();
+            let may_be_it = std::mem::replace(&mut ties.may_be_it, true);
             match ties.drawn.take() {
                 Some(drawn) => samples.push(drawn.sample(camera, speed)),
-                None => beside.extend(steady.map(|drawn| drawn.sample(camera, speed))),
+                None => {
+                    beside.extend(steady.map(|drawn| (drawn.sample(camera, speed), may_be_it)));
+                }
             }
         }
         if beside.len() >= samples.len().max(LEAST_BESIDE) {
-            samples.append(&mut beside);
+            samples.extend(beside.drain(..).map(|(sample, _)| sample));
         }
+        let beside = beside.into_iter().filter(|(_, may_be_it)| *may_be_it);
+        let beside = beside.map(|(sample, _)| sample).collect();
         Draw { age_s: self.age_s(), samples, beside }
     }
 

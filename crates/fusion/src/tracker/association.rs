@@ -88,28 +88,27 @@ impl Tracker {
         }
     }
 
-    /// Notes beside each track that several cameras support, and of which the exposure has no
-    /// bearing, the line that passes nearest to it: of those that are no track's, and that something
-    /// gives which moves. What stands in the view is not the target seen by a turned camera.
+    /// Notes the line that passes nearest to each track that several cameras support and of which the
+    /// exposure has no bearing. A camera that is turned may see the target there, if the line is no
+    /// other track's and what gives it does not stand in the view.
     pub(super) fn note_beside(
         &mut self,
         exposure: &Exposure,
         known: &KnownCamera,
         owners: &[Option<TrackId>],
     ) {
-        let free = exposure.sightings.iter().zip(owners);
-        let free =
-            free.filter(|(sighting, owner)| owner.is_none() && sighting.rooted == Rooted::No);
-        let free: Vec<&Sighting> = free.map(|(sighting, _)| sighting).collect();
         let tracks = self.tracks.iter_mut().filter(|(id, track)| {
             track.is_confirmed() && track.is_triangulated() && !owners.contains(&Some(**id))
         });
         for (_, track) in tracks {
             let expected = track.position_at(exposure.time) - known.camera.pose().position();
-            let away = |sighting: &Sighting| sighting.line.direction.angle(&expected);
-            let beside = free.iter().filter(|sighting| away(sighting) < BESIDE_RAD);
-            if let Some(nearest) = beside.min_by(|one, other| away(one).total_cmp(&away(other))) {
-                track.gather_beside(&exposure.bearing(&nearest.line));
+            let lines = exposure.sightings.iter().zip(owners).map(|(sighting, owner)| {
+                (sighting.line.direction.angle(&expected), sighting, owner)
+            });
+            let beside = lines.filter(|(away, ..)| *away < BESIDE_RAD);
+            if let Some((_, nearest, owner)) = beside.min_by(|a, b| a.0.total_cmp(&b.0)) {
+                let may_be_it = owner.is_none() && nearest.rooted == Rooted::No;
+                track.gather_beside(&exposure.bearing(&nearest.line), may_be_it);
             }
         }
     }
