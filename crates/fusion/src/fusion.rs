@@ -384,8 +384,8 @@ impl Fusion {
         (step.fittings, step.used)
     }
 
-    /// Compares what the cameras see of the tracks: learns how good their poses are, and whether one
-    /// has been moved.
+    /// Compares what the cameras see of the tracks: learns how good their poses are, and whether
+    /// one has been moved.
     fn compare_poses(&mut self, now: Timestamp) {
         for Draw { age_s, mut samples, mut beside } in self.tracker.draws() {
             // The error of a mount's angles is a new one after each turn: cameras on mounts are

@@ -4,7 +4,7 @@
 //! |---|---|---|
 //! | where it stands, from when on | its calibrations | `calibration.rs` |
 //! | how good its pose is | how well its lines meet the others' | `pose_scale.rs` |
-//! | whether it has been moved, and what that does to its pose | the same, over 20 and 100 s | `watch.rs` |
+//! | whether it has been moved, so that its pose is less sure | the same, for longer | `watch.rs` |
 //! | how noisy its bearings are | third differences of its own bearings | `noise.rs` |
 //! | its clutter: bearings of no target | what no track takes | `clutter.rs` |
 //! | what stands in its view for good | what it reports in one place | `rooted.rs` |

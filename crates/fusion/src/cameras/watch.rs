@@ -42,9 +42,9 @@ const FREEDOM: f64 = 4.0;
 /// did. With half of it 30 times would do, against odds of a thousand.
 const SURE: f64 = 6.9;
 
-/// How often the chance that a camera has been moved is computed, s: 64 cameras cost 25 ms, and the
-/// cost grows with the third power. With half of it twice that, and tracks say half a second earlier
-/// how unsure they are.
+/// How often the chance that a camera has been moved is computed, s: 64 cameras cost 25 ms, and
+/// the cost grows with the third power. With half of it twice that, and tracks say half a second
+/// earlier how unsure they are.
 const ASKED_EVERY_S: f64 = 1.0;
 
 /// Fewer cameras do not check one another: with two, an error in the plane of their sight lines
@@ -211,8 +211,8 @@ impl ErrorWatch {
     /// it was, it is even.
     fn chances(&self) -> Vec<(CameraName, Moved)> {
         let knocks: Vec<_> = self.knocks().collect();
-        // One camera has been moved, or none: P(k) = e^w_k / (1 + sum e^w), with w_k the log odds of
-        // the lines less the logarithm of the odds against it beforehand.
+        // One camera has been moved, or none: P(k) = e^w_k / (1 + sum e^w), with w_k the log odds
+        // of the lines less the logarithm of the odds against it beforehand.
         let weight = |own: &Knocks| own.log_odds - SURE;
         let most = knocks.iter().map(|(_, own)| weight(own)).fold(0.0, f64::max);
         let all =

@@ -34,8 +34,8 @@ pub(super) fn alone<'a>(views: &BTreeMap<&'a CameraName, View<'_>>) -> Vec<&'a C
     all().filter(is_alone).map(|(name, _)| name).collect()
 }
 
-/// Whether one of two cameras sees any of the places in the other's view: a narrow view lies between
-/// the places of a wide one.
+/// Whether one of two cameras sees any of the places in the other's view: a narrow view lies
+/// between the places of a wide one.
 fn cross(one: &Camera, other: &Camera) -> bool {
     sees_any(one, other) || sees_any(other, one)
 }
