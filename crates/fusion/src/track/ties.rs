@@ -59,7 +59,8 @@ const STEADY: f64 = 0.2;
 /// row.
 const STEADY_DRAWS: u32 = 5;
 /// At least this many cameras must have it beside the target for the size of their errors to be
-/// learnt from it: a single one (half of it) may be turned, which the watch for moved cameras finds.
+/// learnt from it: a single one (half of it) may be turned, and the watch for moved cameras finds
+/// that.
 const LEAST_BESIDE: usize = 2;
 
 /// The ties of a track to one camera that has seen it, and how that camera sees the target.

@@ -88,9 +88,9 @@ impl Tracker {
         }
     }
 
-    /// Notes the line that passes nearest to each track that several cameras support and of which the
-    /// exposure has no bearing. A camera that is turned may see the target there, if the line is no
-    /// other track's and what gives it does not stand in the view.
+    /// Notes the line that passes nearest to each track that several cameras support and of which
+    /// the exposure has no bearing. A camera that is turned may see the target there, if the line
+    /// is no other track's and what gives it does not stand in the view.
     pub(super) fn note_beside(
         &mut self,
         exposure: &Exposure,
