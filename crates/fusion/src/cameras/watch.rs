@@ -349,6 +349,21 @@ mod tests {
         assert!(found.values().all(|own| !own.is_moved) && found.len() == 1, "{found:?}");
     }
 
+    /// By hand: a turn of 5 mrad about an axis across the view shifts lines by 5 mrad / sqrt 2 in
+    /// the mean of both tangents, and the declared pose by 0.3 mrad or what `declared_rad` says.
+    #[test]
+    fn the_factor_is_what_a_turn_does_to_the_lines_over_what_the_declared_pose_does() {
+        for declared_rad in [3e-4, 3e-5] {
+            let mut watch = watched(Vector3::new(5e-3, 0.0, 0.0), 20.0);
+            let mut seen = samples(Vector3::zeros(), Point3::new(0.0, 0.0, 25.0));
+            seen[0].pose = Matrix2::identity() * declared_rad;
+            watch.cameras[0].see(&seen[0]);
+            let expected = 5e-3_f64.powi(2) / 2.0 / declared_rad.powi(2);
+            let factor = watch.chances()[0].1.factor;
+            assert!((factor / expected - 1.0).abs() < 0.05, "{factor} {expected}");
+        }
+    }
+
     /// The probability that each of the two cameras has been moved.
     fn chances(watch: &ErrorWatch) -> [f64; 2] {
         let chances = watch.chances();

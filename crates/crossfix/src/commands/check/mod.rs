@@ -19,8 +19,8 @@ use views::View;
 /// Check configuration files before anything starts, and print what they resolve to.
 ///
 /// Videos are opened and compared with the intrinsics; of a folder, all files must fit together,
-/// and certificates that are there must be believed. Who sees nothing that another camera sees is
-/// named.
+/// and certificates that are there must be believed. A camera that sees nothing that another one
+/// sees is named.
 #[derive(Debug, clap::Args)]
 #[command(after_help = examples(&[
     "crossfix check -c configs/site",

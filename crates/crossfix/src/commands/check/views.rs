@@ -14,7 +14,7 @@ const NEAREST_M: f64 = 5.0;
 /// cross beyond ten kilometres seem to be alone.
 const FARTHEST_M: f64 = 20_000.0;
 
-/// A camera by its name, as it is held against the others.
+/// A camera as it is compared with the others.
 pub(super) struct View<'a> {
     pub(super) camera: &'a Camera,
     /// Whether a mount turns it: then it may look anywhere.
@@ -45,7 +45,8 @@ fn sees_any(other: &Camera, camera: &Camera) -> bool {
     let lens = other.model().intrinsics();
     let narrower =
         (f64::from(lens.size.width) / lens.fx).min(f64::from(lens.size.height) / lens.fy);
-    // From range to range by half of the other's narrower view, so that it lies between no two.
+    // From range to range by half of the other's narrower view, so that it lies between no two; by
+    // a fifth at most, and at least by a milliradian's, so that their number is bounded.
     let step = 1.0 + (narrower / 2.0).clamp(1e-3, 0.2);
     let size = camera.model().intrinsics().size;
     let along = |side: u32, k: u32| f64::from(side - 1) * f64::from(k) / f64::from(PLACES - 1);

@@ -14,6 +14,9 @@ const KNOCKS_RAD: [f64; 4] = [1e-3, 3e-3, 1e-2, 3e-2];
 /// Least deviation of a pose's rotation, rad: 0.1 mrad is what a mast does in the sun. With half of
 /// it the sun would move cameras whose pose is declared exact.
 const LEAST_TURN_RAD: f64 = 1e-4;
+/// A pose whose declared error shifts lines by less than this is exact, rad: the factor on its
+/// covariance stays finite. With half of it a factor of 1e9 would be one of 4e9.
+const EXACT_RAD: f64 = 1e-6;
 /// Least deviation of its position, m. Where an exact pose is declared, nothing else would allow
 /// for the errors that a lens leaves; with half of it those of targets near the camera may count as
 /// a move.
@@ -104,7 +107,7 @@ impl Watched {
         let along = self.forward.dot(&(squares * self.forward.into_inner()));
         let moved_rad2 = (squares.trace() - along) / 2.0;
         // A pose that is declared exact stays so, whatever the factor.
-        let factor = moved_rad2 / self.declared_rad2.max(LEAST_TURN_RAD.powi(2));
+        let factor = moved_rad2 / self.declared_rad2.max(EXACT_RAD.powi(2));
         Some(Knocks { likeliest, log_odds, factor })
     }
 
