@@ -245,11 +245,15 @@ def foxglove(address, wanted=LIVE_MESSAGES):
     import websockets
     from mcap.records import Schema
 
+    channels, topics = {}, {}
+
     async def listen():
-        channels, topics, left = {}, {}, int(wanted)
+        left = int(wanted)
         decoders = mcap_protobuf.decoder.DecoderFactory()
+        # With a bounded queue the client stops reading once it is full, and would at the end wait for a
+        # goodbye that it never reads.
         async with websockets.connect(f"ws://{address}", subprotocols=["foxglove.sdk.v1"],
-                                      max_size=None, proxy=None) as socket:
+                                      max_size=None, max_queue=None, proxy=None) as socket:
             need(socket.subprotocol == "foxglove.sdk.v1", f"sub-protocol {socket.subprotocol}")
             info = json.loads(await socket.recv())
             need(info["op"] == "serverInfo", f"first comes {info['op']}")
@@ -274,7 +278,12 @@ def foxglove(address, wanted=LIVE_MESSAGES):
         named = {said[0]: said[1] for said in channels.values()}
         return {"checkers": ["websockets"], "server": info, "channels": named, "topics": topics}
 
-    return asyncio.run(asyncio.wait_for(listen(), LIVE_WAIT_S))
+    try:
+        return asyncio.run(asyncio.wait_for(listen(), LIVE_WAIT_S))
+    except TimeoutError:
+        heard = {topic: entry["messages"] for topic, entry in topics.items()}
+        told = [topic for topic, *_ in channels.values()]
+        raise ValueError(f"after {LIVE_WAIT_S} s heard {heard} of {told}") from None
 
 
 def main():
