@@ -35,7 +35,7 @@ const MAX_DRAW_RATIO: f64 = 30.0;
 /// Least factor (variance) on a careful survey's pose covariance: a microradian, which keeps
 /// covariances regular. With ten microradians tracks seen from kilometres away claimed to know half
 /// of what they did.
-const LEAST_SCALE: f64 = 1e-6;
+pub(super) const LEAST_SCALE: f64 = 1e-6;
 /// Largest factor (variance): a pose that is worse is no pose. On a careful survey's milliradian it
 /// is a radian. With half of it the same.
 const MAX_SCALE: f64 = 1e6;
@@ -94,7 +94,8 @@ pub(super) struct PoseScale {
     moved: Moved,
     /// The factor as the tracks know it.
     told: f64,
-    /// Least factor: a declared pose is not made better than it says.
+    /// Least factor: a declared pose is not made better than it says, and another one than all lines
+    /// together allow ([`super::watch`]).
     least: f64,
     greatest: f64,
     draws: f64,
@@ -107,8 +108,7 @@ impl PoseScale {
     /// For a camera whose pose's deviation somebody has declared, or not, and of which nothing is
     /// learnt yet.
     pub(super) fn new(is_declared: bool) -> Self {
-        let (least, greatest) =
-            if is_declared { (1.0, MAX_DECLARED_SCALE) } else { (LEAST_SCALE, MAX_SCALE) };
+        let (least, greatest) = (1.0, if is_declared { MAX_DECLARED_SCALE } else { MAX_SCALE });
         Self {
             value: 1.0,
             moved: Moved::default(),
@@ -119,6 +119,11 @@ impl PoseScale {
             found: 0.0,
             expected: 0.0,
         }
+    }
+
+    /// Whether somebody has declared the pose's deviation.
+    pub(super) fn is_declared(&self) -> bool {
+        self.greatest <= MAX_DECLARED_SCALE
     }
 
     /// The factor on the pose's covariance, as the tracks know it.
@@ -162,17 +167,21 @@ impl PoseScale {
         // hides the pose error, inversely to the factor where the pose error is all. The root is
         // between the two. Compared under the old factor one error would count ten times; the
         // factor of a declared pose is bounded, and real flights are better for counting it so.
-        if self.greatest > MAX_DECLARED_SCALE {
+        if !self.is_declared() {
             self.found /= (next / self.value).max(1.0).sqrt();
         }
         self.value = next;
         self.tell()
     }
 
-    /// Takes in the chance that the camera has been moved; returns by how much the tracks' factor
-    /// changes, if it does.
-    pub(super) fn doubt(&mut self, moved: Moved) -> Option<f64> {
+    /// Takes in the chance that the camera has been moved, and the least factor of a pose that
+    /// nobody has declared; returns by how much the tracks' factor changes, if it does.
+    pub(super) fn judge(&mut self, moved: Moved, least: Option<f64>) -> Option<f64> {
         self.moved = moved;
+        if let Some(least) = least {
+            self.least = least;
+            self.value = self.value.max(least);
+        }
         self.tell()
     }
 

@@ -10,6 +10,7 @@
 
 mod knock;
 mod memory;
+mod survey;
 
 use std::collections::BTreeMap;
 
@@ -21,7 +22,7 @@ use super::pose_scale::Moved;
 use super::{Cameras, ScaleSample};
 use crate::evidence::ONE_IN_A_HUNDRED;
 use knock::{Knocks, Watched};
-use memory::Memory;
+use memory::{ErrorEstimate, Memory};
 
 /// Time constants of the memories, s in which targets are seen: a camera was moved that long ago,
 /// or longer, each as likely. A large turn shows in the shorter time, while most of the longer one
@@ -199,18 +200,37 @@ impl ErrorWatch {
         Some(())
     }
 
+    /// All cameras' errors by each of the memories, the longest last.
+    fn estimates(&self) -> Vec<ErrorEstimate> {
+        self.memories.iter().filter_map(Memory::estimate).collect()
+    }
+
     /// What the lines say of each camera if it has been moved.
-    fn knocks(&self) -> impl Iterator<Item = (&Watched, Knocks)> {
-        let estimates: Vec<_> = self.memories.iter().filter_map(Memory::estimate).collect();
+    fn knocks(&self, estimates: &[ErrorEstimate]) -> impl Iterator<Item = (&Watched, Knocks)> {
         self.cameras.iter().enumerate().filter_map(move |(place, camera)| {
-            Some((camera, camera.knocks(&estimates, ERRORS * place)?))
+            Some((camera, camera.knocks(estimates, ERRORS * place)?))
         })
+    }
+
+    /// The least factor on the covariance of each pose whose deviation nobody has declared, by all
+    /// lines of late: an error of a pose lasts, but how much of the noise lasts is only learnt.
+    fn least_factors(
+        &self,
+        estimates: &[ErrorEstimate],
+        is_declared: impl Fn(&CameraName) -> bool,
+    ) -> BTreeMap<CameraName, f64> {
+        let cameras = self.cameras.iter().enumerate();
+        let undeclared = cameras.filter(|(_, camera)| !is_declared(&camera.name));
+        let firsts = undeclared.map(|(place, _)| ERRORS * place).collect();
+        let found = estimates.first().and_then(|latest| survey::least_factors(latest, firsts));
+        let name = |first: usize| self.cameras[first / ERRORS].name.clone();
+        found.into_iter().flatten().map(|(first, least)| (name(first), least)).collect()
     }
 
     /// The chance that each camera has been moved. Where the lines do not tell which of two cameras
     /// it was, it is even.
-    fn chances(&self) -> Vec<(CameraName, Moved)> {
-        let knocks: Vec<_> = self.knocks().collect();
+    fn chances(&self, estimates: &[ErrorEstimate]) -> Vec<(CameraName, Moved)> {
+        let knocks: Vec<_> = self.knocks(estimates).collect();
         // One camera has been moved, or none: P(k) = e^w_k / (1 + sum e^w), with w_k the log odds
         // of the lines less the logarithm of the odds against it beforehand.
         let weight = |own: &Knocks| own.log_odds - SURE;
@@ -229,8 +249,9 @@ impl ErrorWatch {
 
     /// What the lines say of each camera that has been watched.
     fn findings(&self) -> BTreeMap<CameraName, PoseFinding> {
-        let found =
-            self.knocks().map(|(camera, knocks)| (camera.name.clone(), camera.finding(&knocks)));
+        let estimates = self.estimates();
+        let found = self.knocks(&estimates);
+        let found = found.map(|(camera, knocks)| (camera.name.clone(), camera.finding(&knocks)));
         let mut found: BTreeMap<CameraName, PoseFinding> = found.collect();
         let most = found.values().map(|own| own.log_odds).fold(f64::NEG_INFINITY, f64::max);
         // Every camera that explains the lines nearly as well as the likeliest one stays a suspect.
@@ -266,13 +287,18 @@ impl Cameras {
             places.push(watch.place_of(&sample.camera, &known.pose_covariance, forward));
         }
         watch.learn(samples, &places, now);
-        let asked = *watch.asked.get_or_insert(now);
-        if now.seconds_since(asked).abs() < ASKED_EVERY_S {
+        let lately = |asked: Timestamp| now.seconds_since(asked).abs() < ASKED_EVERY_S;
+        if watch.asked.is_some_and(lately) {
             return Vec::new();
         }
         watch.asked = Some(now);
-        let changed = watch.chances().into_iter().filter_map(|(name, moved)| {
-            let ratio = by_name.get_mut(&name)?.pose_scale.doubt(moved)?;
+        let estimates = watch.estimates();
+        let is_declared =
+            |name: &CameraName| by_name.get(name).is_none_or(|own| own.pose_scale.is_declared());
+        let least = watch.least_factors(&estimates, is_declared);
+        let changed = watch.chances(&estimates).into_iter().filter_map(|(name, moved)| {
+            let scale = &mut by_name.get_mut(&name)?.pose_scale;
+            let ratio = scale.judge(moved, least.get(&name).copied())?;
             Some((name, ratio))
         });
         changed.collect()
@@ -359,14 +385,14 @@ mod tests {
             seen[0].pose = Matrix2::identity() * declared_rad;
             watch.cameras[0].see(&seen[0]);
             let expected = 5e-3_f64.powi(2) / 2.0 / declared_rad.powi(2);
-            let factor = watch.chances()[0].1.factor;
+            let factor = watch.chances(&watch.estimates())[0].1.factor;
             assert!((factor / expected - 1.0).abs() < 0.05, "{factor} {expected}");
         }
     }
 
     /// The probability that each of the two cameras has been moved.
     fn chances(watch: &ErrorWatch) -> [f64; 2] {
-        let chances = watch.chances();
+        let chances = watch.chances(&watch.estimates());
         ["a", "b"]
             .map(|name| chances.iter().find(|one| one.0.as_str() == name).unwrap().1.probability)
     }
