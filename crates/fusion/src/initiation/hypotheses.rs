@@ -10,6 +10,7 @@ use crossfix_message::{CameraName, Solver, Timestamp};
 use super::one_target::{Mobility, OneTargetTest};
 use super::seeds::{Seed, SeedFinder};
 use super::selection::{PeriodLine, ScoredLines, Selection};
+use super::standing::StandingLines;
 use super::{MAX_LINES, NewTrack};
 use crate::cameras::{Cameras, KnownCamera, Rooted};
 use crate::comparison::{Candidate, Comparison, ComparisonRules};
@@ -82,6 +83,7 @@ pub(super) struct Hypotheses {
     /// Speed of targets, m/s, standard deviation per axis.
     speed: f64,
     shared_lines: usize,
+    standing: StandingLines,
     hypotheses: Vec<Hypothesis>,
     /// Lines that have been used by a track which only one camera supports.
     provisional: BTreeMap<LineId, TrackId>,
@@ -99,17 +101,20 @@ impl Hypothesis {
     }
 
     /// Whether what stands in the cameras' views explains it: but for one camera at most, whose
-    /// line may be clutter (of two cameras, but for none). As long as this is unknown of a line
-    /// (its camera has only begun to look), two cameras are not enough.
-    fn stands(&self) -> bool {
+    /// line may be clutter (of two cameras, but for none), unless so little stands there that it
+    /// crosses nowhere by chance. As long as this is unknown of a line (its camera has only begun
+    /// to look), two cameras are not enough.
+    fn stands(&self, lines: &StandingLines) -> bool {
+        let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
         let cameras = self.cameras();
-        let newest = || self.rooted.iter().filter(|(camera, _)| cameras.contains(camera));
-        let others = newest().filter(|(_, rooted)| **rooted != Rooted::Yes).count();
-        if cameras.len() == 2 {
-            others == 0 || newest().any(|(_, rooted)| *rooted == Rooted::Unknown)
-        } else {
-            others < 2
+        if cameras.len() == 2 && cameras.iter().any(|camera| rooted(camera) == Rooted::Unknown) {
+            return true;
         }
+        let standing: Vec<&CameraName> =
+            cameras.iter().copied().filter(|camera| rooted(camera) == Rooted::Yes).collect();
+        let others = cameras.len() - standing.len();
+        let clutter = usize::from(cameras.len() > 2);
+        others <= clutter && lines.may_cross(standing.into_iter())
     }
 
     /// Least log-likelihood ratio of one target against an object per camera with which it is
@@ -120,19 +125,25 @@ impl Hypothesis {
     /// be found ten seconds later. If none of its lines has been seen to come or to move, all may
     /// stand, and it needs as much more as against any other rival. If it is disputed, a third
     /// camera would have to miss a target that it should see: one in a hundred.
-    fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
+    fn least_one_target_ratio(
+        &self,
+        lines: &BTreeMap<&CameraName, [usize; 2]>,
+        standing: &StandingLines,
+    ) -> f64 {
         let cameras = self.cameras();
         let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
+        let moves = cameras.iter().any(|camera| rooted(camera) == Rooted::No);
         let choices = cameras.iter().map(|camera| {
-            let may_stand = cameras.len() > 2 && rooted(camera) == Rooted::Yes;
+            let may_stand = (cameras.len() > 2 || !moves) && rooted(camera) == Rooted::Yes;
             let number = lines.get(camera);
             let number = number.map_or(1, |[all, others]| if may_stand { *all } else { *others });
             (number.max(1) as f64).ln()
         });
         let choices: f64 = choices.sum();
-        let moves = cameras.iter().any(|camera| rooted(camera) == Rooted::No);
         if !moves {
-            choices + BEYOND_DOUBT
+            let apart = cameras.iter().all(|c| rooted(c) == Rooted::Yes)
+                && !standing.may_cross(cameras.iter().copied());
+            choices + if apart { -ONE_IN_A_HUNDRED } else { BEYOND_DOUBT }
         } else if self.is_disputed && cameras.len() == 2 {
             choices - ONE_IN_A_HUNDRED
         } else {
@@ -156,6 +167,7 @@ impl Hypotheses {
             pair_s: config.initiation.pair_s,
             speed: config.initiation.velocity_prior_sd_mps,
             shared_lines: config.initiation.shared_lines,
+            standing: StandingLines::new(config.initiation.periods as u64),
             hypotheses: Vec::new(),
             provisional: BTreeMap::new(),
             period: 0,
@@ -201,7 +213,9 @@ impl Hypotheses {
         let held = self.held();
         // In the first period nothing can have been followed before.
         let is_first = self.period == 1;
-        let seeds = self.finder.find(exposures, cameras, |id| is_first || held.contains(id));
+        self.standing.see(self.period, exposures);
+        let is_held = |id: &LineId| is_first || held.contains(id);
+        let seeds = self.finder.find(exposures, cameras, Some(&self.standing), is_held);
         self.begin(seeds, exposures, motion);
         self.prune();
         let now = exposures.last().map(|exposure| exposure.time);
@@ -351,7 +365,11 @@ impl Hypotheses {
         let scored = likely.map(|h| ScoredLines { score: h.track.score, lines: &h.lines });
         let selection = Selection::new(scored, self.shared_lines);
         let state = |i: usize| self.hypotheses[i].track.predicted(now, motion);
-        let likely = selection.chosen().filter(|&i| self.is_likely(&self.hypotheses[i], lines));
+        let is_likely = |&i: &usize| {
+            let hypothesis = &self.hypotheses[i];
+            self.is_likely(hypothesis, lines) && !hypothesis.stands(&self.standing)
+        };
+        let likely = selection.chosen().filter(is_likely);
         let has_no_rival = |&i: &usize| {
             let own = state(i);
             selection.margin_of(i, |k| same_target(&own, &state(k))) >= BEYOND_DOUBT
@@ -385,13 +403,9 @@ impl Hypotheses {
         // Lines of two targets, each seen by another one of two cameras, may cross for a while.
         let pair_lasts = track.updated_at.seconds_since(*born) >= self.pair_s && track.is_placed();
         let agreed = hypothesis.cameras().len() >= 3 || pair_lasts;
-        let least = hypothesis.least_one_target_ratio(lines);
+        let least = hypothesis.least_one_target_ratio(lines, &self.standing);
         let is_one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= least);
-        agreed
-            && is_one
-            && !hypothesis.stands()
-            && track.score >= self.confirm_score
-            && hypothesis.periods >= self.needed
+        agreed && is_one && track.score >= self.confirm_score && hypothesis.periods >= self.needed
     }
 
     fn start(&self, hypothesis: &Hypothesis) -> NewTrack {

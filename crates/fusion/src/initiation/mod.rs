@@ -11,6 +11,7 @@ mod period;
 mod seeds;
 mod selection;
 mod sight;
+pub(crate) mod standing;
 
 use std::collections::BTreeSet;
 

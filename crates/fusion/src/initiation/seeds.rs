@@ -9,6 +9,7 @@ use crossfix_message::Timestamp;
 use nalgebra::{Point3, Vector3};
 
 use super::passing::{Passing, Passings};
+use super::standing::StandingLines;
 use super::{NamedLine, lines_with_pose};
 use crate::cameras::Cameras;
 use crate::cameras::Rooted;
@@ -87,6 +88,7 @@ pub(crate) struct SeedFinder {
 struct Growing<'a> {
     exposures: &'a [&'a Exposure],
     cameras: &'a Cameras,
+    standing: Option<&'a StandingLines>,
     lines: &'a [Vec<NamedLine>],
 }
 
@@ -107,6 +109,17 @@ impl Growing<'_> {
     /// Whether a line is to an object fixed in its camera's view.
     fn rooted(&self, at: LineIndex) -> Rooted {
         self.exposures[at.exposure].sightings[at.line].rooted
+    }
+
+    /// Whether a set may consist of lines to objects fixed in their cameras' views that cross by
+    /// chance. As long as this is unknown of a line (its camera has only begun to look), two cameras
+    /// are not enough and three must agree.
+    fn may_be_rooted(&self, set: &[LineIndex]) -> bool {
+        let rooted = || set.iter().map(|&at| self.rooted(at));
+        let cameras = || set.iter().map(|at| &self.exposures[at.exposure].camera);
+        set.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown)
+            || rooted().all(|rooted| rooted == Rooted::Yes)
+                && self.standing.is_none_or(|standing| standing.may_cross(cameras()))
     }
 }
 
@@ -134,17 +147,19 @@ impl SeedFinder {
         }
     }
 
-    /// All seeds of one period, the likeliest first. `is_held` tells of a line whether something
+    /// All seeds of one period, the likeliest first; what stands in the views may be a target where
+    /// `standing` says that its lines do not cross by chance. `is_held` tells of a line whether something
     /// that has been followed before goes on with it.
     pub(crate) fn find(
         &self,
         exposures: &[&Exposure],
         cameras: &Cameras,
+        standing: Option<&StandingLines>,
         is_held: impl Fn(&LineId) -> bool,
     ) -> Vec<Seed> {
         let lines: Vec<Vec<NamedLine>> =
             exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
-        let growing = Growing { exposures, cameras, lines: &lines };
+        let growing = Growing { exposures, cameras, standing, lines: &lines };
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
         let mut seeds = Vec::new();
         let mut close = 0;
@@ -158,8 +173,7 @@ impl SeedFinder {
                     }
                     let both =
                         [LineIndex { exposure: a, line: i }, LineIndex { exposure: b, line: j }];
-                    let is_rooted = both.iter().all(|&at| growing.rooted(at) == Rooted::Yes);
-                    if is_rooted && exposures.len() == 2 {
+                    if exposures.len() == 2 && growing.may_be_rooted(&both) {
                         continue;
                     }
                     let [one, other] = both.map(|at| &growing.line(at).1);
@@ -305,7 +319,7 @@ impl SeedFinder {
         set: &[LineIndex],
         solution: MapSolution,
     ) -> Option<Seed> {
-        if set.len() < self.least_cameras || is_rooted(growing, set) {
+        if set.len() < self.least_cameras || growing.may_be_rooted(set) {
             return None;
         }
         let mut lines: Vec<NamedLine> = set.iter().map(|&at| growing.line(at).clone()).collect();
@@ -365,15 +379,6 @@ impl SeedFinder {
         }
         evidence.is_finite().then_some(evidence)
     }
-}
-
-/// Whether a set consists of lines to objects fixed in their cameras' views. As long as this is
-/// unknown of a line (its camera has only begun to look), two cameras are not enough and three must
-/// agree.
-fn is_rooted(growing: &Growing<'_>, set: &[LineIndex]) -> bool {
-    let rooted = || set.iter().map(|&at| growing.rooted(at));
-    rooted().all(|rooted| rooted == Rooted::Yes)
-        || (set.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown))
 }
 
 /// The likeliest seeds, each set once.

@@ -41,11 +41,11 @@ impl FixFinder {
             SpatialSolver::Pair => self.pair_fixes(exposures),
             SpatialSolver::Triple => self.triple_fixes(exposures),
             SpatialSolver::Stacked => {
-                let sets = self.seeds.find(exposures, cameras, |_| true).into_iter();
+                let sets = self.seeds.find(exposures, cameras, None, |_| true).into_iter();
                 sets.filter_map(|seed| self.stacked_fix(seed.lines)).collect()
             }
             SpatialSolver::Map => {
-                let sets = self.seeds.find(exposures, cameras, |_| true).into_iter();
+                let sets = self.seeds.find(exposures, cameras, None, |_| true).into_iter();
                 sets.filter_map(|seed| {
                     let (observability, state) =
                         (seed.solution.observability(), seed.solution.state.clone());

@@ -1,0 +1,50 @@
+//! Whether lines to what stands in the cameras' views cross by chance.
+
+use std::collections::BTreeMap;
+
+use crossfix_message::CameraName;
+
+use crate::Exposure;
+use crate::cameras::Rooted;
+use crate::evidence::ONE_IN_A_HUNDRED;
+
+/// How many things stand in each camera's view that no track explains, in each of the last periods
+/// of which lines count.
+#[derive(Debug)]
+pub(crate) struct StandingLines {
+    /// Number of periods that count.
+    span: u64,
+    /// Largest number of lines in an exposure, by period.
+    numbers: BTreeMap<CameraName, BTreeMap<u64, usize>>,
+}
+
+impl StandingLines {
+    pub(crate) fn new(span: u64) -> Self {
+        Self { span, numbers: BTreeMap::new() }
+    }
+
+    /// Takes in the exposures of a period.
+    pub(crate) fn see(&mut self, period: u64, exposures: &[&Exposure]) {
+        for exposure in exposures {
+            let stands = exposure.sightings.iter().filter(|seen| seen.rooted == Rooted::Yes);
+            let number = stands.count();
+            let of_camera = self.numbers.entry(exposure.camera.clone()).or_default();
+            let most = of_camera.entry(period).or_default();
+            *most = number.max(*most);
+        }
+        for of_camera in self.numbers.values_mut() {
+            of_camera.retain(|seen, _| seen + self.span > period);
+        }
+    }
+
+    /// Whether some lines of all these cameras to such things may cross by chance. They stand along
+    /// the horizon: a line to one passes through the place that other cameras' lines make in one
+    /// case of a hundred, so that n cameras with `N_k` of them each make `N_1 ... N_n / 100^(n - 1)`
+    /// such places. More than one in a hundred is too many.
+    pub(crate) fn may_cross<'a>(&self, cameras: impl Iterator<Item = &'a CameraName>) -> bool {
+        let number = |name| self.numbers.get(name)?.values().copied().max();
+        let logs: Vec<f64> =
+            cameras.map(|name| (number(name).unwrap_or(0).max(1) as f64).ln()).collect();
+        logs.iter().sum::<f64>() + (logs.len() as f64 - 2.0) * ONE_IN_A_HUNDRED > 0.0
+    }
+}
