@@ -282,3 +282,28 @@ fn what_stands_near_the_horizon_of_each_camera_is_no_target_and_what_flies_befor
     assert_eq!(found_s.len(), 16);
     assert!(found_s.iter().all(|seconds| *seconds < 1.0), "{found_s:?}");
 }
+
+/// Before two cameras it takes few such things until some of their lines cross: with four each,
+/// one site in six.
+#[test]
+fn what_stands_near_the_horizon_of_two_cameras_is_no_target() {
+    let mut ghosts = 0;
+    for seed in 0..40 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let eyes = &quick_site()[..2];
+        let mut frames: Vec<BearingFrame> = Vec::new();
+        for eye in eyes {
+            let paths = horizon_of(eye, 4, &mut rng);
+            let scene = Scene { eyes: vec![eye.clone()], clutter: 0.5, ..Scene::new(paths, 8.0) };
+            frames.extend(scene.frames(seed));
+        }
+        frames.sort_by_key(|frame| frame.capture_time_ns);
+        let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
+        for eye in eyes {
+            fusion.calibrate(&common::calibration(eye).with_pose_sd(1e-3, 0.05)).unwrap();
+        }
+        frames.iter().for_each(|frame| drop(fusion.ingest(frame)));
+        ghosts += fusion.tracks().filter(|track| track.is_confirmed()).count();
+    }
+    assert_eq!(ghosts, 0, "of 40 sites");
+}

@@ -99,6 +99,34 @@ fn two_targets_that_one_camera_at_a_time_sees_are_both_found() {
     }
 }
 
+/// A target that hovers, and sways by so many metres in the wind.
+fn hovering(sway_m: f64) -> Path {
+    Box::new(move |t| {
+        let (east, north) = ((1.3 * t).sin(), (0.9 * t).cos());
+        Some(Point3::new(10.0 + sway_m * east, 5.0 + sway_m * north, 40.0))
+    })
+}
+
+/// It was there before the cameras began to look: it is told from nothing that stands in their views
+/// but by how its lines meet, and nothing else stands there.
+#[test]
+fn a_target_that_hovers_from_the_beginning_is_found_by_two_cameras_and_by_three_slow_ones() {
+    for (cameras, rate_hz, detection) in
+        [(2, 10.0, 0.9), (2, 2.0, 0.9), (3, 5.0, 0.5), (3, 2.0, 0.9)]
+    {
+        let mut found = 0;
+        for (seed, sway_m) in SEEDS.flat_map(|seed| [0.0, 0.3].map(|sway_m| (seed, sway_m))) {
+            let scene = Scene { detection, ..Scene::new(vec![hovering(sway_m)], 20.0) };
+            let mut eyes = site()[..cameras].to_vec();
+            eyes.iter_mut().for_each(|eye| eye.rate_hz = rate_hz);
+            let mut flight = Flight::new(Scene { eyes, ..scene }, seed);
+            found += usize::from(flight.until(20.0).track(0).is_some());
+            assert!(flight.confirmed() <= 1, "{cameras} at {rate_hz} Hz, seed {seed}");
+        }
+        assert!(found >= 18, "{cameras} cameras at {rate_hz} Hz: {found} of 20");
+    }
+}
+
 /// Comes from `side` metres off the x axis to `near` metres from it, stays for ten seconds, parts.
 fn meeting(side: f64, near: f64) -> Path {
     Box::new(move |t| {

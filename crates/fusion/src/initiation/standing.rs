@@ -48,3 +48,37 @@ impl StandingLines {
         logs.iter().sum::<f64>() + (logs.len() as f64 - 2.0) * ONE_IN_A_HUNDRED > 0.0
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: of two cameras each may have one, as 1 / 100 is not more than one in a hundred; of
+    /// three the product may be up to a hundred.
+    #[test]
+    fn two_cameras_may_have_one_standing_thing_each_and_three_about_five() {
+        let names = ["a", "b", "c"].map(|name| name.parse::<CameraName>().unwrap());
+        let crosses = |numbers: &[usize]| {
+            let mut lines = StandingLines::new(2);
+            for (name, number) in names.iter().zip(numbers) {
+                lines.numbers.insert(name.clone(), BTreeMap::from([(1, *number)]));
+            }
+            lines.may_cross(names.iter().take(numbers.len()))
+        };
+        assert!(!crosses(&[1, 1]) && crosses(&[1, 2]) && crosses(&[2, 2]));
+        assert!(!crosses(&[4, 4, 6]) && crosses(&[5, 5, 5]));
+        // Of one camera alone there is nothing to cross.
+        assert!(crosses(&[1]));
+    }
+
+    #[test]
+    fn only_the_last_periods_count() {
+        let name: CameraName = "a".parse().unwrap();
+        let mut lines = StandingLines::new(2);
+        lines.numbers.insert(name.clone(), BTreeMap::from([(1, 3), (2, 1)]));
+        lines.see(2, &[]);
+        assert_eq!(lines.numbers[&name].values().max(), Some(&3));
+        lines.see(3, &[]);
+        assert_eq!(lines.numbers[&name].values().max(), Some(&1));
+    }
+}

@@ -123,3 +123,49 @@ impl Told {
         Some((squares - log_determinant - log_prior) / 2.0)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::memory::Memory;
+    use super::*;
+
+    /// The least factors of two cameras whose lines have given this information on each pose error,
+    /// in units of a careful survey's deviations, and these errors.
+    fn of_two(information: f64, found: f64) -> [f64; 2] {
+        let mut memory = Memory::default();
+        memory.widen(2 * ERRORS);
+        for error in (0..2 * ERRORS).filter(|error| error % ERRORS != CLOCK) {
+            memory.information[(error, error)] = information;
+            memory.pull[error] = information * found;
+        }
+        let least = least_factors(&memory.estimate().unwrap(), vec![0, ERRORS]).unwrap();
+        [least[0].1, least[1].1]
+    }
+
+    /// By hand: 0.1 for careful, and for exact but this one 0.9 x 0.1 / 2.
+    #[test]
+    fn without_a_line_the_explanations_are_as_likely_as_before() {
+        let expected = CAREFUL + (1.0 - CAREFUL) * ONE_IS_OFF / 2.0;
+        for least in of_two(0.0, 0.0) {
+            assert!((least - expected).abs() < 1e-5, "{least} {expected}");
+        }
+    }
+
+    #[test]
+    fn errors_as_of_a_careful_survey_exclude_exact_poses_and_none_excludes_the_survey() {
+        assert!(of_two(100.0, 1.0).iter().all(|least| *least > 0.99));
+        assert!(of_two(100.0, 0.0).iter().all(|least| *least < 1e-5));
+    }
+
+    /// By hand: twelve errors of which the lines have a tenth of the prior's information are as
+    /// likely found to be zero as without it of exact poses, and 1.1^-6 times that of careful ones; a
+    /// camera that is off is then less likely than one in a hundred.
+    #[test]
+    fn a_little_information_tells_a_little() {
+        let careful = CAREFUL * 1.1_f64.powi(-6);
+        let expected = careful / (careful + (1.0 - CAREFUL) * (1.0 - ONE_IS_OFF));
+        for least in of_two(0.1, 0.0) {
+            assert!((least - expected).abs() < 1e-5, "{least} {expected}");
+        }
+    }
+}
