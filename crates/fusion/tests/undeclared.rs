@@ -64,8 +64,8 @@ fn errors(eyes: &[Eye], wrong: f64, seed: u64) -> Vec<[f64; 2]> {
 }
 
 /// Of a site of two cameras one number shows how well its lines meet, and of a site of three three.
-/// When each pose was believed as far as they alone told, a fifth of the answers of two cameras were
-/// beyond four deviations.
+/// When each pose was believed as far as they alone told, 8 % of the answers of two cameras and 7 % of
+/// those of three were beyond four deviations.
 #[test]
 fn a_lucky_pose_is_not_taken_for_an_exact_one() {
     for cameras in [2, 3] {
@@ -74,7 +74,7 @@ fn a_lucky_pose_is_not_taken_for_an_exact_one() {
         let beyond = errors.iter().filter(|[_, deviations]| *deviations > 4.0).count();
         let share = beyond as f64 / errors.len() as f64;
         assert!(errors.len() > 10_000, "{}", errors.len());
-        assert!(share < 0.03, "{cameras} cameras: {share} of the answers beyond four deviations");
+        assert!(share < 0.02, "{cameras} cameras: {share} of the answers beyond four deviations");
     }
 }
 
