@@ -283,19 +283,18 @@ fn what_stands_near_the_horizon_of_each_camera_is_no_target_and_what_flies_befor
     assert!(found_s.iter().all(|seconds| *seconds < 1.0), "{found_s:?}");
 }
 
-/// Before two cameras it takes few such things until some of their lines cross: with four each,
-/// one site in six.
-#[test]
-fn what_stands_near_the_horizon_of_two_cameras_is_no_target() {
+/// How many tracks are confirmed before cameras with so many things of their own near the horizon.
+fn ghosts_of_horizons(eyes: &[common::Eye], count: usize, detection: f64, seconds: f64) -> u64 {
     let mut ghosts = 0;
-    for seed in 0..40 {
+    for seed in 0..20 {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let eyes = &quick_site()[..2];
         let mut frames: Vec<BearingFrame> = Vec::new();
-        for eye in eyes {
-            let paths = horizon_of(eye, 4, &mut rng);
-            let scene = Scene { eyes: vec![eye.clone()], clutter: 0.5, ..Scene::new(paths, 8.0) };
-            frames.extend(scene.frames(seed));
+        for (eye, of_eye) in eyes.iter().zip(0..) {
+            let paths = horizon_of(eye, count, &mut rng);
+            let eyes = vec![eye.clone()];
+            let scene = Scene { eyes, detection, ..Scene::new(paths, seconds) };
+            // Each camera with noise and misses of its own.
+            frames.extend(scene.frames(100 * seed + of_eye));
         }
         frames.sort_by_key(|frame| frame.capture_time_ns);
         let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
@@ -303,7 +302,38 @@ fn what_stands_near_the_horizon_of_two_cameras_is_no_target() {
             fusion.calibrate(&common::calibration(eye).with_pose_sd(1e-3, 0.05)).unwrap();
         }
         frames.iter().for_each(|frame| drop(fusion.ingest(frame)));
-        ghosts += fusion.tracks().filter(|track| track.is_confirmed()).count();
+        ghosts += fusion.counters().get("tracks_confirmed");
     }
-    assert_eq!(ghosts, 0, "of 40 sites");
+    ghosts
+}
+
+/// Before two cameras it takes few such things until some of their lines cross: with four each in
+/// one site of six, and with one each before six cameras nearly as often.
+#[test]
+fn what_stands_near_the_horizon_of_two_cameras_or_six_is_no_target() {
+    let two = &quick_site()[..2];
+    assert_eq!(ghosts_of_horizons(two, 4, 1.0, 8.0), 0);
+    // What is seldom detected stands there in between, too. One that is seen so seldom that it
+    // passes for new is there whether or not such things are counted.
+    assert!(ghosts_of_horizons(two, 4, 0.4, 40.0) <= 1);
+    let ring: Vec<common::Eye> = (0..6)
+        .map(|k| {
+            let (east, north) = (f64::from(k) * 1.05).sin_cos();
+            let at = [150.0 * east, 150.0 * north, 3.0];
+            common::eye(&format!("ring{k}"), at, [0.0, 0.0, 40.0], 0.015 * f64::from(k))
+        })
+        .collect();
+    assert_eq!(ghosts_of_horizons(&ring, 1, 1.0, 8.0), 0);
+}
+
+/// What two cameras see standing in one place, and nothing else stands in their views, is a target:
+/// a lamp between them cannot be told from a drone that hovers.
+#[test]
+fn a_lone_lamp_that_two_cameras_see_is_a_target() {
+    let lamp = || straight([5.0, -8.0, 35.0], [0.0; 3]);
+    let eyes = quick_site()[..2].to_vec();
+    let scene = Scene { eyes, ..Scene::new(vec![lamp()], 8.0) };
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    scene.frames(1).iter().for_each(|frame| drop(fusion.ingest(frame)));
+    assert!(found(&fusion, &lamp()).is_some());
 }

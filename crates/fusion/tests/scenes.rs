@@ -107,8 +107,8 @@ fn hovering(sway_m: f64) -> Path {
     })
 }
 
-/// It was there before the cameras began to look: it is told from nothing that stands in their views
-/// but by how its lines meet, and nothing else stands there.
+/// It was there before the cameras began to look: it is told from nothing that stands in their
+/// views but by how its lines meet, and nothing else stands there.
 #[test]
 fn a_target_that_hovers_from_the_beginning_is_found_by_two_cameras_and_by_three_slow_ones() {
     for (cameras, rate_hz, detection) in

@@ -94,8 +94,8 @@ pub(super) struct PoseScale {
     moved: Moved,
     /// The factor as the tracks know it.
     told: f64,
-    /// Least factor: a declared pose is not made better than it says, and another one than all lines
-    /// together allow ([`super::watch`]).
+    /// Least factor: a declared pose is not made better than it says. For another one it is what
+    /// all lines together say ([`super::watch`]).
     least: f64,
     greatest: f64,
     draws: f64,

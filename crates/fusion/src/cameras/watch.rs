@@ -43,7 +43,7 @@ const FREEDOM: f64 = 4.0;
 /// did. With half of it 30 times would do, against odds of a thousand.
 const SURE: f64 = 6.9;
 
-/// How often the chance that a camera has been moved is computed, s: 64 cameras cost 25 ms, and
+/// How often the chance that a camera has been moved is computed, s: 64 cameras cost 27 ms, and
 /// the cost grows with the third power. With half of it twice that, and tracks say half a second
 /// earlier how unsure they are.
 const ASKED_EVERY_S: f64 = 1.0;
@@ -200,9 +200,10 @@ impl ErrorWatch {
         Some(())
     }
 
-    /// All cameras' errors by each of the memories, the longest last.
+    /// All cameras' errors by each of the memories, the longest last; none if the numbers of one
+    /// fail.
     fn estimates(&self) -> Vec<ErrorEstimate> {
-        self.memories.iter().filter_map(Memory::estimate).collect()
+        self.memories.iter().map(Memory::estimate).collect::<Option<_>>().unwrap_or_default()
     }
 
     /// What the lines say of each camera if it has been moved.
@@ -212,8 +213,9 @@ impl ErrorWatch {
         })
     }
 
-    /// The least factor on the covariance of each pose whose deviation nobody has declared, by all
-    /// lines of late: an error of a pose lasts, but how much of the noise lasts is only learnt.
+    /// The least factor on the covariance of each pose whose deviation nobody has declared, by the
+    /// lines of the shorter memory: before it is known how much of a camera's noise lasts, that
+    /// passes for an error of its pose, and the longer memory would keep it for a minute.
     fn least_factors(
         &self,
         estimates: &[ErrorEstimate],

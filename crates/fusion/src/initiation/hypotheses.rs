@@ -100,55 +100,61 @@ impl Hypothesis {
         self.lines.iter().map(|line| &line.id.camera).collect()
     }
 
-    /// Whether what stands in the cameras' views explains it: but for one camera at most, whose
-    /// line may be clutter (of two cameras, but for none), unless so little stands there that it
+    /// Whether a camera's newest line is of something that stands in its view.
+    fn rooted(&self, camera: &CameraName) -> Rooted {
+        self.rooted.get(camera).copied().unwrap_or_default()
+    }
+
+    /// The cameras in whose views what it is made of stands, if all of it does but for one line at
+    /// most, which may be clutter (of two cameras, but for none).
+    fn standing(&self) -> Option<Vec<&CameraName>> {
+        let cameras = self.cameras();
+        let clutter = usize::from(cameras.len() > 2);
+        let (standing, others): (Vec<_>, Vec<_>) =
+            cameras.into_iter().partition(|camera| self.rooted(camera) == Rooted::Yes);
+        (others.len() <= clutter).then_some(standing)
+    }
+
+    /// Whether what stands in the cameras' views explains it: not if so little stands there that it
     /// crosses nowhere by chance. As long as this is unknown of a line (its camera has only begun
     /// to look), two cameras are not enough.
     fn stands(&self, lines: &StandingLines) -> bool {
-        let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
         let cameras = self.cameras();
-        if cameras.len() == 2 && cameras.iter().any(|camera| rooted(camera) == Rooted::Unknown) {
-            return true;
-        }
-        let standing: Vec<&CameraName> =
-            cameras.iter().copied().filter(|camera| rooted(camera) == Rooted::Yes).collect();
-        let others = cameras.len() - standing.len();
-        let clutter = usize::from(cameras.len() > 2);
-        others <= clutter && lines.may_cross(standing.into_iter())
+        let is_unknown = cameras.iter().any(|camera| self.rooted(camera) == Rooted::Unknown);
+        (is_unknown && cameras.len() == 2)
+            || self.standing().is_some_and(|standing| lines.may_cross(standing.into_iter()))
     }
 
     /// Least log-likelihood ratio of one target against an object per camera with which it is
     /// confirmed: the logarithm of the number of sets of lines that it may have been chosen from by
     /// chance, the product of the numbers of its cameras' lines. What stands in a view is counted
     /// where the hypothesis has such a line, but not for two cameras, of which one line at least
-    /// does not stand: a target that flies slowly passes for standing before one of them, and would
-    /// be found ten seconds later. If none of its lines has been seen to come or to move, all may
-    /// stand, and it needs as much more as against any other rival. If it is disputed, a third
-    /// camera would have to miss a target that it should see: one in a hundred.
-    fn least_one_target_ratio(
-        &self,
-        lines: &BTreeMap<&CameraName, [usize; 2]>,
-        standing: &StandingLines,
-    ) -> f64 {
+    /// has come or moved: a target that flies slowly passes for standing before one of them, and
+    /// would be found ten seconds later. What stands needs a hundred times as much, and so does
+    /// what is disputed: a third camera would have to miss a target that it should see. Else, if
+    /// none of its lines has been seen to come or to move, all may stand, and it needs as much more
+    /// as against any other rival.
+    fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
         let cameras = self.cameras();
-        let rooted = |camera: &CameraName| self.rooted.get(camera).copied().unwrap_or_default();
-        let moves = cameras.iter().any(|camera| rooted(camera) == Rooted::No);
+        let moves = cameras.iter().any(|camera| self.rooted(camera) == Rooted::No);
         let choices = cameras.iter().map(|camera| {
-            let may_stand = (cameras.len() > 2 || !moves) && rooted(camera) == Rooted::Yes;
+            let may_stand = self.rooted(camera) == Rooted::Yes;
+            let all_count = may_stand && (cameras.len() > 2 || !moves);
             let number = lines.get(camera);
-            let number = number.map_or(1, |[all, others]| if may_stand { *all } else { *others });
+            let number = number.map_or(1, |[all, others]| if all_count { *all } else { *others });
             (number.max(1) as f64).ln()
         });
-        let choices: f64 = choices.sum();
-        if !moves {
-            let apart = cameras.iter().all(|c| rooted(c) == Rooted::Yes)
-                && !standing.may_cross(cameras.iter().copied());
-            choices + if apart { -ONE_IN_A_HUNDRED } else { BEYOND_DOUBT }
-        } else if self.is_disputed && cameras.len() == 2 {
-            choices - ONE_IN_A_HUNDRED
-        } else {
-            choices
+        let mut least: f64 = choices.sum();
+        let stands = self.standing().is_some();
+        if stands {
+            least -= ONE_IN_A_HUNDRED;
+        } else if !moves {
+            least += BEYOND_DOUBT;
         }
+        if self.is_disputed && cameras.len() == 2 {
+            least -= ONE_IN_A_HUNDRED;
+        }
+        least
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {
@@ -167,7 +173,7 @@ impl Hypotheses {
             pair_s: config.initiation.pair_s,
             speed: config.initiation.velocity_prior_sd_mps,
             shared_lines: config.initiation.shared_lines,
-            standing: StandingLines::new(config.initiation.periods as u64),
+            standing: StandingLines::default(),
             hypotheses: Vec::new(),
             provisional: BTreeMap::new(),
             period: 0,
@@ -213,7 +219,7 @@ impl Hypotheses {
         let held = self.held();
         // In the first period nothing can have been followed before.
         let is_first = self.period == 1;
-        self.standing.see(self.period, exposures);
+        self.standing.see(exposures);
         let is_held = |id: &LineId| is_first || held.contains(id);
         let seeds = self.finder.find(exposures, cameras, Some(&self.standing), is_held);
         self.begin(seeds, exposures, motion);
@@ -403,7 +409,7 @@ impl Hypotheses {
         // Lines of two targets, each seen by another one of two cameras, may cross for a while.
         let pair_lasts = track.updated_at.seconds_since(*born) >= self.pair_s && track.is_placed();
         let agreed = hypothesis.cameras().len() >= 3 || pair_lasts;
-        let least = hypothesis.least_one_target_ratio(lines, &self.standing);
+        let least = hypothesis.least_one_target_ratio(lines);
         let is_one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= least);
         agreed && is_one && track.score >= self.confirm_score && hypothesis.periods >= self.needed
     }

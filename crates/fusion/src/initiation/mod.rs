@@ -11,7 +11,7 @@ mod period;
 mod seeds;
 mod selection;
 mod sight;
-pub(crate) mod standing;
+mod standing;
 
 use std::collections::BTreeSet;
 

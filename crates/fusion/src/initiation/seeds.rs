@@ -5,6 +5,7 @@ use std::f64::consts::PI;
 
 use crossfix_filter::Gate;
 use crossfix_geometry::Pose;
+use crossfix_message::CameraName;
 use crossfix_message::Timestamp;
 use nalgebra::{Point3, Vector3};
 
@@ -111,15 +112,20 @@ impl Growing<'_> {
         self.exposures[at.exposure].sightings[at.line].rooted
     }
 
+    /// Whether lines of these cameras to what stands in their views may cross by chance.
+    fn may_cross<'b>(&self, cameras: impl Iterator<Item = &'b CameraName>) -> bool {
+        self.standing.is_none_or(|standing| standing.may_cross(cameras))
+    }
+
     /// Whether a set may consist of lines to objects fixed in their cameras' views that cross by
-    /// chance. As long as this is unknown of a line (its camera has only begun to look), two cameras
-    /// are not enough and three must agree.
+    /// chance. As long as this is unknown of a line (its camera has only begun to look), two
+    /// cameras are not enough and three must agree.
     fn may_be_rooted(&self, set: &[LineIndex]) -> bool {
         let rooted = || set.iter().map(|&at| self.rooted(at));
-        let cameras = || set.iter().map(|at| &self.exposures[at.exposure].camera);
-        set.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown)
-            || rooted().all(|rooted| rooted == Rooted::Yes)
-                && self.standing.is_none_or(|standing| standing.may_cross(cameras()))
+        let is_unknown = set.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown);
+        let stands = rooted().all(|rooted| rooted == Rooted::Yes);
+        let cameras = set.iter().map(|at| &self.exposures[at.exposure].camera);
+        is_unknown || (stands && self.may_cross(cameras))
     }
 }
 
@@ -148,8 +154,8 @@ impl SeedFinder {
     }
 
     /// All seeds of one period, the likeliest first; what stands in the views may be a target where
-    /// `standing` says that its lines do not cross by chance. `is_held` tells of a line whether something
-    /// that has been followed before goes on with it.
+    /// `standing` says that its lines do not cross by chance. `is_held` tells of a line whether
+    /// something that has been followed before goes on with it.
     pub(crate) fn find(
         &self,
         exposures: &[&Exposure],
@@ -164,6 +170,8 @@ impl SeedFinder {
         let mut seeds = Vec::new();
         let mut close = 0;
         for [a, b] in self.pairs_of_cameras(&growing) {
+            let pair = [a, b].map(|exposure| &exposures[exposure].camera);
+            let may_cross = exposures.len() == 2 && growing.may_cross(pair.into_iter());
             for i in 0..lines[a].len() {
                 for j in 0..lines[b].len() {
                     let enough = close > BOUNDS.close_pairs || seeds.len() > BOUNDS.found;
@@ -173,7 +181,8 @@ impl SeedFinder {
                     }
                     let both =
                         [LineIndex { exposure: a, line: i }, LineIndex { exposure: b, line: j }];
-                    if exposures.len() == 2 && growing.may_be_rooted(&both) {
+                    let stand = both.iter().all(|&at| growing.rooted(at) == Rooted::Yes);
+                    if stand && may_cross {
                         continue;
                     }
                     let [one, other] = both.map(|at| &growing.line(at).1);

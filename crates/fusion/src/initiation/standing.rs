@@ -2,50 +2,61 @@
 
 use std::collections::BTreeMap;
 
-use crossfix_message::CameraName;
+use crossfix_message::{CameraName, Timestamp};
 
 use crate::Exposure;
 use crate::cameras::Rooted;
-use crate::evidence::ONE_IN_A_HUNDRED;
 
-/// How many things stand in each camera's view that no track explains, in each of the last periods
-/// of which lines count.
-#[derive(Debug)]
+/// For how long the largest number of lines counts, s: what is seldom detected stands there in
+/// between, too. With half of it a tree that the detector misses for six seconds is forgotten.
+const MEMORY_S: i64 = 10;
+/// Things stand along the horizon, and a line to one of them passes through the place that other
+/// cameras' lines make in one case of so many (a milliradian in a band of a few degrees); one site
+/// in so many may have a crossing by chance. With half of it the lines of three cameras may make
+/// fifty sets and not a hundred.
+const CASES: f64 = 100.0;
+
+/// How many things have lately stood in each camera's view that no track explains.
+#[derive(Debug, Default)]
 pub(crate) struct StandingLines {
-    /// Number of periods that count.
-    span: u64,
-    /// Largest number of lines in an exposure, by period.
-    numbers: BTreeMap<CameraName, BTreeMap<u64, usize>>,
+    /// Largest number of lines in an exposure, by second.
+    numbers: BTreeMap<CameraName, BTreeMap<i64, usize>>,
 }
 
 impl StandingLines {
-    pub(crate) fn new(span: u64) -> Self {
-        Self { span, numbers: BTreeMap::new() }
-    }
-
-    /// Takes in the exposures of a period.
-    pub(crate) fn see(&mut self, period: u64, exposures: &[&Exposure]) {
+    /// Takes in exposures.
+    pub(super) fn see(&mut self, exposures: &[&Exposure]) {
         for exposure in exposures {
             let stands = exposure.sightings.iter().filter(|seen| seen.rooted == Rooted::Yes);
-            let number = stands.count();
-            let of_camera = self.numbers.entry(exposure.camera.clone()).or_default();
-            let most = of_camera.entry(period).or_default();
-            *most = number.max(*most);
-        }
-        for of_camera in self.numbers.values_mut() {
-            of_camera.retain(|seen, _| seen + self.span > period);
+            self.note(&exposure.camera, exposure.time, stands.count());
         }
     }
 
-    /// Whether some lines of all these cameras to such things may cross by chance. They stand along
-    /// the horizon: a line to one passes through the place that other cameras' lines make in one
-    /// case of a hundred, so that n cameras with `N_k` of them each make `N_1 ... N_n / 100^(n - 1)`
-    /// such places. More than one in a hundred is too many.
-    pub(crate) fn may_cross<'a>(&self, cameras: impl Iterator<Item = &'a CameraName>) -> bool {
-        let number = |name| self.numbers.get(name)?.values().copied().max();
-        let logs: Vec<f64> =
-            cameras.map(|name| (number(name).unwrap_or(0).max(1) as f64).ln()).collect();
-        logs.iter().sum::<f64>() + (logs.len() as f64 - 2.0) * ONE_IN_A_HUNDRED > 0.0
+    fn note(&mut self, camera: &CameraName, time: Timestamp, number: usize) {
+        let second = time.seconds().floor() as i64;
+        let of_camera = self.numbers.entry(camera.clone()).or_default();
+        of_camera.retain(|then, _| (second - MEMORY_S..=second).contains(then));
+        let most = of_camera.entry(second).or_default();
+        *most = number.max(*most);
+    }
+
+    fn number(&self, camera: &CameraName) -> usize {
+        self.numbers.get(camera).and_then(|own| own.values().copied().max()).unwrap_or(0)
+    }
+
+    /// Whether some lines of as many cameras as these to such things may cross by chance. n cameras
+    /// with `N_k` of them each make `N_1 ... N_n / 100^(n - 1)` crossings, and of K cameras that
+    /// see such things there are `K! / (n! (K - n)!)` sets of n. More than one in a hundred of all
+    /// is too many.
+    pub(super) fn may_cross<'a>(&self, cameras: impl Iterator<Item = &'a CameraName>) -> bool {
+        let numbers: Vec<f64> = cameras.map(|name| self.number(name).max(1) as f64).collect();
+        let size = numbers.len();
+        let seeing = self.numbers.keys().filter(|name| self.number(name) > 0).count();
+        let sets: f64 =
+            (0..size).map(|k| seeing.max(size).saturating_sub(k) as f64 / (k + 1) as f64).product();
+        let crossings = numbers.iter().product::<f64>() * sets / CASES.powi(size as i32 - 1);
+        // Rounding makes no difference of one that is exactly as many.
+        crossings * CASES > 1.0 + 1e-9
     }
 }
 
@@ -53,32 +64,46 @@ impl StandingLines {
 mod tests {
     use super::*;
 
-    /// By hand: of two cameras each may have one, as 1 / 100 is not more than one in a hundred; of
-    /// three the product may be up to a hundred.
+    fn names(count: usize) -> Vec<CameraName> {
+        (0..count).map(|k| format!("camera{k}").parse().unwrap()).collect()
+    }
+
+    /// Whether lines of the first `of` cameras may cross, where these numbers of things stand in
+    /// the views.
+    fn crosses(numbers: &[usize], of: usize) -> bool {
+        let mut lines = StandingLines::default();
+        let names = names(numbers.len());
+        for (name, number) in names.iter().zip(numbers) {
+            lines.note(name, Timestamp::from_seconds(1.0), *number);
+        }
+        lines.may_cross(names.iter().take(of))
+    }
+
+    /// By hand: of two cameras each may have one, 1 / 100; of three the product may be 100, as 100
+    /// / 100^2 is one in a hundred.
     #[test]
-    fn two_cameras_may_have_one_standing_thing_each_and_three_about_five() {
-        let names = ["a", "b", "c"].map(|name| name.parse::<CameraName>().unwrap());
-        let crosses = |numbers: &[usize]| {
-            let mut lines = StandingLines::new(2);
-            for (name, number) in names.iter().zip(numbers) {
-                lines.numbers.insert(name.clone(), BTreeMap::from([(1, *number)]));
-            }
-            lines.may_cross(names.iter().take(numbers.len()))
-        };
-        assert!(!crosses(&[1, 1]) && crosses(&[1, 2]) && crosses(&[2, 2]));
-        assert!(!crosses(&[4, 4, 6]) && crosses(&[5, 5, 5]));
+    fn two_cameras_may_have_one_standing_thing_each_and_three_a_hundred_sets() {
+        assert!(!crosses(&[1, 1], 2) && crosses(&[1, 2], 2) && crosses(&[2, 2], 2));
+        assert!(!crosses(&[4, 4, 6], 3) && !crosses(&[4, 5, 5], 3) && crosses(&[5, 5, 5], 3));
         // Of one camera alone there is nothing to cross.
-        assert!(crosses(&[1]));
+        assert!(crosses(&[1], 1));
+    }
+
+    /// By hand: six cameras make fifteen pairs and twenty sets of three.
+    #[test]
+    fn the_more_cameras_see_such_things_the_more_sets_may_cross() {
+        assert!(crosses(&[1; 6], 2) && !crosses(&[1, 1, 0, 0, 0, 0], 2));
+        assert!(!crosses(&[1; 6], 3) && crosses(&[2; 6], 3));
     }
 
     #[test]
-    fn only_the_last_periods_count() {
-        let name: CameraName = "a".parse().unwrap();
-        let mut lines = StandingLines::new(2);
-        lines.numbers.insert(name.clone(), BTreeMap::from([(1, 3), (2, 1)]));
-        lines.see(2, &[]);
-        assert_eq!(lines.numbers[&name].values().max(), Some(&3));
-        lines.see(3, &[]);
-        assert_eq!(lines.numbers[&name].values().max(), Some(&1));
+    fn what_is_seldom_detected_counts_for_ten_seconds() {
+        let mut lines = StandingLines::default();
+        let name = &names(1)[0];
+        lines.note(name, Timestamp::from_seconds(1.0), 3);
+        lines.note(name, Timestamp::from_seconds(10.9), 1);
+        assert_eq!(lines.number(name), 3);
+        lines.note(name, Timestamp::from_seconds(12.0), 1);
+        assert_eq!(lines.number(name), 1);
     }
 }
