@@ -97,7 +97,8 @@ pub(super) struct PoseScale {
     /// Least factor: a declared pose is not made better than it says. For another one it is what
     /// all lines together say ([`super::watch`]).
     least: f64,
-    greatest: f64,
+    /// Whether somebody has declared the pose's deviation.
+    is_declared: bool,
     draws: f64,
     /// Running means of the camera's squared pose error by the draws, and of its expectation.
     found: f64,
@@ -108,13 +109,12 @@ impl PoseScale {
     /// For a camera whose pose's deviation somebody has declared, or not, and of which nothing is
     /// learnt yet.
     pub(super) fn new(is_declared: bool) -> Self {
-        let (least, greatest) = (1.0, if is_declared { MAX_DECLARED_SCALE } else { MAX_SCALE });
         Self {
             value: 1.0,
             moved: Moved::default(),
             told: 1.0,
-            least,
-            greatest,
+            least: 1.0,
+            is_declared,
             draws: 0.0,
             found: 0.0,
             expected: 0.0,
@@ -123,7 +123,7 @@ impl PoseScale {
 
     /// Whether somebody has declared the pose's deviation.
     pub(super) fn is_declared(&self) -> bool {
-        self.greatest <= MAX_DECLARED_SCALE
+        self.is_declared
     }
 
     /// The factor on the pose's covariance, as the tracks know it.
@@ -162,12 +162,13 @@ impl PoseScale {
         let found = self.found + TYPICAL_WEIGHT * typical / self.value;
         let step = (found / (self.expected + TYPICAL_WEIGHT)).sqrt();
         let step = step.clamp(LARGEST_STEP.recip(), LARGEST_STEP);
-        let next = (self.value * step).clamp(self.least, self.greatest);
+        let greatest = if self.is_declared { MAX_DECLARED_SCALE } else { MAX_SCALE };
+        let next = (self.value * step).clamp(self.least, greatest);
         // Under the new factor the errors found so far come out smaller: not at all where noise
         // hides the pose error, inversely to the factor where the pose error is all. The root is
         // between the two. Compared under the old factor one error would count ten times; the
         // factor of a declared pose is bounded, and real flights are better for counting it so.
-        if !self.is_declared() {
+        if !self.is_declared {
             self.found /= (next / self.value).max(1.0).sqrt();
         }
         self.value = next;

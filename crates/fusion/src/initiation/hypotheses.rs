@@ -8,9 +8,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use crossfix_message::{CameraName, Solver, Timestamp};
 
 use super::one_target::{Mobility, OneTargetTest};
+use super::rooted_lines::RootedLines;
 use super::seeds::{Seed, SeedFinder};
 use super::selection::{PeriodLine, ScoredLines, Selection};
-use super::standing::StandingLines;
 use super::{MAX_LINES, NewTrack};
 use crate::cameras::{Cameras, KnownCamera, Rooted};
 use crate::comparison::{Candidate, Comparison, ComparisonRules};
@@ -83,7 +83,7 @@ pub(super) struct Hypotheses {
     /// Speed of targets, m/s, standard deviation per axis.
     speed: f64,
     shared_lines: usize,
-    standing: StandingLines,
+    rooted_lines: RootedLines,
     hypotheses: Vec<Hypothesis>,
     /// Lines that have been used by a track which only one camera supports.
     provisional: BTreeMap<LineId, TrackId>,
@@ -107,22 +107,22 @@ impl Hypothesis {
 
     /// The cameras in whose views what it is made of stands, if all of it does but for one line at
     /// most, which may be clutter (of two cameras, but for none).
-    fn standing(&self) -> Option<Vec<&CameraName>> {
+    fn rooted_cameras(&self) -> Option<Vec<&CameraName>> {
         let cameras = self.cameras();
         let clutter = usize::from(cameras.len() > 2);
-        let (standing, others): (Vec<_>, Vec<_>) =
+        let (rooted, others): (Vec<_>, Vec<_>) =
             cameras.into_iter().partition(|camera| self.rooted(camera) == Rooted::Yes);
-        (others.len() <= clutter).then_some(standing)
+        (others.len() <= clutter).then_some(rooted)
     }
 
     /// Whether what stands in the cameras' views explains it: not if so little stands there that it
     /// crosses nowhere by chance. As long as this is unknown of a line (its camera has only begun
     /// to look), two cameras are not enough.
-    fn stands(&self, lines: &StandingLines) -> bool {
+    fn stands(&self, lines: &RootedLines) -> bool {
         let cameras = self.cameras();
         let is_unknown = cameras.iter().any(|camera| self.rooted(camera) == Rooted::Unknown);
         (is_unknown && cameras.len() == 2)
-            || self.standing().is_some_and(|standing| lines.may_cross(standing.into_iter()))
+            || self.rooted_cameras().is_some_and(|rooted| lines.may_cross(rooted.into_iter()))
     }
 
     /// Least log-likelihood ratio of one target against an object per camera with which it is
@@ -145,7 +145,7 @@ impl Hypothesis {
             (number.max(1) as f64).ln()
         });
         let mut least: f64 = choices.sum();
-        let stands = self.standing().is_some();
+        let stands = self.rooted_cameras().is_some();
         if stands {
             least -= ONE_IN_A_HUNDRED;
         } else if !moves {
@@ -173,7 +173,7 @@ impl Hypotheses {
             pair_s: config.initiation.pair_s,
             speed: config.initiation.velocity_prior_sd_mps,
             shared_lines: config.initiation.shared_lines,
-            standing: StandingLines::default(),
+            rooted_lines: RootedLines::default(),
             hypotheses: Vec::new(),
             provisional: BTreeMap::new(),
             period: 0,
@@ -219,9 +219,9 @@ impl Hypotheses {
         let held = self.held();
         // In the first period nothing can have been followed before.
         let is_first = self.period == 1;
-        self.standing.see(exposures);
+        self.rooted_lines.see(exposures);
         let is_held = |id: &LineId| is_first || held.contains(id);
-        let seeds = self.finder.find(exposures, cameras, Some(&self.standing), is_held);
+        let seeds = self.finder.find(exposures, cameras, Some(&self.rooted_lines), is_held);
         self.begin(seeds, exposures, motion);
         self.prune();
         let now = exposures.last().map(|exposure| exposure.time);
@@ -373,7 +373,7 @@ impl Hypotheses {
         let state = |i: usize| self.hypotheses[i].track.predicted(now, motion);
         let is_likely = |&i: &usize| {
             let hypothesis = &self.hypotheses[i];
-            self.is_likely(hypothesis, lines) && !hypothesis.stands(&self.standing)
+            self.is_likely(hypothesis, lines) && !hypothesis.stands(&self.rooted_lines)
         };
         let likely = selection.chosen().filter(is_likely);
         let has_no_rival = |&i: &usize| {

@@ -8,10 +8,10 @@ mod hypotheses;
 mod one_target;
 mod passing;
 mod period;
+mod rooted_lines;
 mod seeds;
 mod selection;
 mod sight;
-mod standing;
 
 use std::collections::BTreeSet;
 

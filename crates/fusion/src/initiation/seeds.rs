@@ -5,12 +5,11 @@ use std::f64::consts::PI;
 
 use crossfix_filter::Gate;
 use crossfix_geometry::Pose;
-use crossfix_message::CameraName;
-use crossfix_message::Timestamp;
+use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Point3, Vector3};
 
 use super::passing::{Passing, Passings};
-use super::standing::StandingLines;
+use super::rooted_lines::RootedLines;
 use super::{NamedLine, lines_with_pose};
 use crate::cameras::Cameras;
 use crate::cameras::Rooted;
@@ -89,7 +88,7 @@ pub(crate) struct SeedFinder {
 struct Growing<'a> {
     exposures: &'a [&'a Exposure],
     cameras: &'a Cameras,
-    standing: Option<&'a StandingLines>,
+    rooted_lines: Option<&'a RootedLines>,
     lines: &'a [Vec<NamedLine>],
 }
 
@@ -114,7 +113,7 @@ impl Growing<'_> {
 
     /// Whether lines of these cameras to what stands in their views may cross by chance.
     fn may_cross<'b>(&self, cameras: impl Iterator<Item = &'b CameraName>) -> bool {
-        self.standing.is_none_or(|standing| standing.may_cross(cameras))
+        self.rooted_lines.is_none_or(|lines| lines.may_cross(cameras))
     }
 
     /// Whether a set may consist of lines to objects fixed in their cameras' views that cross by
@@ -154,18 +153,18 @@ impl SeedFinder {
     }
 
     /// All seeds of one period, the likeliest first; what stands in the views may be a target where
-    /// `standing` says that its lines do not cross by chance. `is_held` tells of a line whether
+    /// `rooted_lines` say that they do not cross by chance. `is_held` tells of a line whether
     /// something that has been followed before goes on with it.
     pub(crate) fn find(
         &self,
         exposures: &[&Exposure],
         cameras: &Cameras,
-        standing: Option<&StandingLines>,
+        rooted_lines: Option<&RootedLines>,
         is_held: impl Fn(&LineId) -> bool,
     ) -> Vec<Seed> {
         let lines: Vec<Vec<NamedLine>> =
             exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
-        let growing = Growing { exposures, cameras, standing, lines: &lines };
+        let growing = Growing { exposures, cameras, rooted_lines, lines: &lines };
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
         let mut seeds = Vec::new();
         let mut close = 0;

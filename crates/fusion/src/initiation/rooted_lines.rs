@@ -1,4 +1,4 @@
-//! Whether lines to what stands in the cameras' views cross by chance.
+//! Whether lines to what stands in the cameras' views for good (is rooted) cross by chance.
 
 use std::collections::BTreeMap;
 
@@ -18,24 +18,28 @@ const CASES: f64 = 100.0;
 
 /// How many things have lately stood in each camera's view that no track explains.
 #[derive(Debug, Default)]
-pub(crate) struct StandingLines {
+pub(crate) struct RootedLines {
     /// Largest number of lines in an exposure, by second.
     numbers: BTreeMap<CameraName, BTreeMap<i64, usize>>,
 }
 
-impl StandingLines {
-    /// Takes in exposures.
+impl RootedLines {
+    /// Takes in the exposures of a period.
     pub(super) fn see(&mut self, exposures: &[&Exposure]) {
         for exposure in exposures {
-            let stands = exposure.sightings.iter().filter(|seen| seen.rooted == Rooted::Yes);
-            self.note(&exposure.camera, exposure.time, stands.count());
+            let rooted = exposure.sightings.iter().filter(|seen| seen.rooted == Rooted::Yes);
+            self.note(&exposure.camera, exposure.time, rooted.count());
         }
     }
 
     fn note(&mut self, camera: &CameraName, time: Timestamp, number: usize) {
         let second = time.seconds().floor() as i64;
+        let lately = second - MEMORY_S..=second;
+        for of_camera in self.numbers.values_mut() {
+            of_camera.retain(|then, _| lately.contains(then));
+        }
+        self.numbers.retain(|_, of_camera| !of_camera.is_empty());
         let of_camera = self.numbers.entry(camera.clone()).or_default();
-        of_camera.retain(|then, _| (second - MEMORY_S..=second).contains(then));
         let most = of_camera.entry(second).or_default();
         *most = number.max(*most);
     }
@@ -71,7 +75,7 @@ mod tests {
     /// Whether lines of the first `of` cameras may cross, where these numbers of things stand in
     /// the views.
     fn crosses(numbers: &[usize], of: usize) -> bool {
-        let mut lines = StandingLines::default();
+        let mut lines = RootedLines::default();
         let names = names(numbers.len());
         for (name, number) in names.iter().zip(numbers) {
             lines.note(name, Timestamp::from_seconds(1.0), *number);
@@ -98,12 +102,16 @@ mod tests {
 
     #[test]
     fn what_is_seldom_detected_counts_for_ten_seconds() {
-        let mut lines = StandingLines::default();
+        let mut lines = RootedLines::default();
         let name = &names(1)[0];
         lines.note(name, Timestamp::from_seconds(1.0), 3);
         lines.note(name, Timestamp::from_seconds(10.9), 1);
         assert_eq!(lines.number(name), 3);
-        lines.note(name, Timestamp::from_seconds(12.0), 1);
+        // Another camera's line: of one that is silent nothing is left, either.
+        let other = &names(2)[1];
+        lines.note(other, Timestamp::from_seconds(12.0), 1);
         assert_eq!(lines.number(name), 1);
+        lines.note(other, Timestamp::from_seconds(30.0), 1);
+        assert_eq!(lines.numbers.len(), 1);
     }
 }
