@@ -130,6 +130,18 @@ impl ErrorWatch {
         }
     }
 
+    /// Takes in whether it is known that part of a camera's noise lasts. What was learnt of its errors
+    /// before that was found is forgotten: such noise was taken to average out, and two lines of it
+    /// passed for an error of the pose that no later line could disprove.
+    fn note_noise(&mut self, place: usize, lasts: bool) {
+        let camera = &mut self.cameras[place];
+        if lasts && !camera.noise_lasts {
+            camera.watched_s = 0.0;
+            self.memories.iter_mut().for_each(|memory| memory.forget(ERRORS * place, ERRORS));
+        }
+        self.cameras[place].noise_lasts = lasts;
+    }
+
     /// Discounts the memories by the time since the last draw.
     fn age(&mut self, now: Timestamp) {
         let last = self.drawn.replace(now);
@@ -286,7 +298,9 @@ impl Cameras {
             let Some(camera) = by_name.get(&sample.camera) else { return Vec::new() };
             let known = camera.known();
             let forward = Unit::new_normalize(known.camera.pose().rotation() * Vector3::z());
-            places.push(watch.place_of(&sample.camera, &known.pose_covariance, forward));
+            let place = watch.place_of(&sample.camera, &known.pose_covariance, forward);
+            watch.note_noise(place, camera.noise_lasts());
+            places.push(place);
         }
         watch.learn(samples, &places, now);
         let lately = |asked: Timestamp| now.seconds_since(asked).abs() < ASKED_EVERY_S;

@@ -35,6 +35,8 @@ pub(super) struct Watched {
     /// The direction in which it looks.
     forward: Unit<Vector3<f64>>,
     pub(super) watched_s: f64,
+    /// Whether it is known that part of its noise lasts.
+    pub(super) noise_lasts: bool,
     /// When the camera was last seen beside others.
     drawn: Option<Timestamp>,
 }
@@ -52,7 +54,16 @@ impl Watched {
             covariance[(axis + 3, axis + 3)] += LEAST_SHIFT_M.powi(2);
         }
         let root = covariance.cholesky().map_or_else(Matrix6::identity, |factor| factor.l());
-        Self { name, covariance, root, declared_rad2: 0.0, forward, watched_s: 0.0, drawn: None }
+        Self {
+            name,
+            covariance,
+            root,
+            declared_rad2: 0.0,
+            forward,
+            watched_s: 0.0,
+            noise_lasts: false,
+            drawn: None,
+        }
     }
 
     /// Notes that the camera has been seen beside others.
