@@ -337,3 +337,33 @@ fn a_lone_lamp_that_two_cameras_see_is_a_target() {
     scene.frames(1).iter().for_each(|frame| drop(fusion.ingest(frame)));
     assert!(found(&fusion, &lamp()).is_some());
 }
+
+/// What one camera follows is real, but it is no target for a false bearing of another camera that
+/// lies near its line's plane.
+#[test]
+fn what_one_camera_follows_makes_no_target_with_clutter_of_another() {
+    let eyes = site();
+    let (mut ghosts, mut looks) = (0, 0);
+    for seed in 0..10 {
+        let drones = (0..4).map(|k| {
+            let k = f64::from(k);
+            straight(
+                [-30.0 + 15.0 * k, 30.0 - 12.0 * k, 30.0 + 8.0 * k],
+                [0.5 - 0.2 * k, 0.3 * k - 0.4, 0.1],
+            )
+        });
+        let of = |eye: usize, paths, clutter| {
+            let eyes = vec![eyes[eye].clone()];
+            Scene { eyes, detection: 0.9, clutter, ..Scene::new(paths, 60.0) }.frames(seed)
+        };
+        let mut frames = of(0, drones.collect(), 0.0);
+        frames.extend(of(1, Vec::new(), 1.0));
+        frames.sort_by_key(|frame| frame.capture_time_ns);
+        let mut fusion = fusion_of(FusionConfig::default(), &eyes[..2]);
+        let confirmed = confirmed_over_time(&mut fusion, &frames);
+        ghosts += confirmed.iter().sum::<usize>();
+        looks += confirmed.len();
+    }
+    // It was 93.
+    assert!(ghosts * 100 < looks, "{ghosts} ghosts in {looks} looks");
+}

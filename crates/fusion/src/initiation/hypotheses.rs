@@ -57,6 +57,9 @@ struct Hypothesis {
     lines: Vec<PeriodLine>,
     /// Whether each camera's newest line is of something that stands in its view.
     rooted: BTreeMap<CameraName, Rooted>,
+    /// Log-likelihood ratio of each camera's lines and misses against clutter, given the lines of
+    /// the others; a seed's counts for each of its cameras.
+    evidence: BTreeMap<CameraName, f64>,
     /// Number of periods that gave it a line.
     periods: usize,
     born: Timestamp,
@@ -103,6 +106,23 @@ impl Hypothesis {
     /// Whether a camera's newest line is of something that stands in its view.
     fn rooted(&self, camera: &CameraName) -> Rooted {
         self.rooted.get(camera).copied().unwrap_or_default()
+    }
+
+    /// Whether enough cameras agree on it: three, or two for at least `pair_s` seconds. Lines of two
+    /// targets, each seen by another one of two cameras, may cross for a while; and what one camera
+    /// gave may be clutter, whatever the other one follows meanwhile: any line that lies near the
+    /// plane of the other's makes a target with it.
+    fn agrees(&self, pair_s: f64, lines: &BTreeMap<&CameraName, [usize; 2]>) -> bool {
+        let cameras = self.cameras();
+        if cameras.len() >= 3 {
+            return true;
+        }
+        let number = |camera: &CameraName| lines.get(camera).map_or(1, |[all, _]| *all).max(1);
+        let choices: f64 = cameras.iter().map(|camera| (number(camera) as f64).ln()).sum();
+        let least = BEYOND_DOUBT + choices;
+        cameras.iter().all(|camera| self.evidence.get(*camera).is_some_and(|own| *own >= least))
+            && self.track.updated_at.seconds_since(self.born) >= pair_s
+            && self.track.is_placed()
     }
 
     /// The cameras in whose views what it is made of stands, if all of it does but for one line at
@@ -280,6 +300,9 @@ impl Hypotheses {
         if is_expected {
             // ln(1 - P(visible) P_D); against one target per camera, ln(1 - P_D) alone.
             hypothesis.track.score += miss;
+            if let Some(own) = hypothesis.evidence.get_mut(&comparison.exposure.camera) {
+                *own += miss;
+            }
             comparison.note(&mut hypothesis.track, false);
             let missed = log_missed(self.rules.detection);
             hypothesis.one_target.miss(&comparison.exposure.camera, missed, interval_s);
@@ -300,6 +323,7 @@ impl Hypotheses {
         let density = motion.density(hypothesis.track.model_probabilities());
         comparison.take(&mut hypothesis.track, index)?;
         hypothesis.track.score += ratio;
+        *hypothesis.evidence.entry(exposure.camera.clone()).or_default() += ratio;
         if let Some(TrackExpectation::Near(prediction)) = prediction {
             let mobility = Mobility { density, speed: self.speed };
             hypothesis.one_target.see(&comparison.bearing(index), prediction, mobility, ratio);
@@ -332,6 +356,8 @@ impl Hypotheses {
             let place = fix.state.position();
             let mut one_target = OneTargetTest::begin(&seed.lines, place, self.speed, seed.score);
             let mut rooted = BTreeMap::new();
+            let cameras = seed.lines.iter().map(|(LineId { camera, .. }, _)| camera.clone());
+            let evidence = cameras.map(|camera| (camera, seed.score)).collect();
             for (id @ LineId { camera, .. }, timed) in &seed.lines {
                 let Some(own) = id.sighting_in(exposures) else { continue };
                 rooted.insert(camera.clone(), own.rooted);
@@ -349,6 +375,7 @@ impl Hypotheses {
                 track,
                 lines: lines.collect(),
                 rooted,
+                evidence,
                 periods: 1,
                 born: time,
                 one_target,
@@ -405,13 +432,12 @@ impl Hypotheses {
         hypothesis: &Hypothesis,
         lines: &BTreeMap<&CameraName, [usize; 2]>,
     ) -> bool {
-        let Hypothesis { track, born, .. } = hypothesis;
-        // Lines of two targets, each seen by another one of two cameras, may cross for a while.
-        let pair_lasts = track.updated_at.seconds_since(*born) >= self.pair_s && track.is_placed();
-        let agreed = hypothesis.cameras().len() >= 3 || pair_lasts;
         let least = hypothesis.least_one_target_ratio(lines);
         let is_one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= least);
-        agreed && is_one && track.score >= self.confirm_score && hypothesis.periods >= self.needed
+        hypothesis.agrees(self.pair_s, lines)
+            && is_one
+            && hypothesis.track.score >= self.confirm_score
+            && hypothesis.periods >= self.needed
     }
 
     fn start(&self, hypothesis: &Hypothesis) -> NewTrack {

@@ -101,22 +101,23 @@ impl OneTargetTest {
         self.sights.push(((*camera).clone(), DirectionFilter::first(line, *time, rate_sd)));
     }
 
-    /// Adds a line that continues the target as predicted. `first_ratio` is its log-likelihood
-    /// ratio, which is used if it is its camera's first.
+    /// Adds a line that continues the target as predicted. `ratio` is its log-likelihood ratio
+    /// against clutter. A line that continues no object of its camera alone is clutter if it is not
+    /// the target's: it says no more for the target than that.
     pub(super) fn see(
         &mut self,
         bearing: &TrackBearing<'_>,
         prediction: &BearingPrediction,
         Mobility { density, speed }: Mobility,
-        first_ratio: f64,
+        ratio: f64,
     ) {
         let TrackBearing { camera, time, line, uncertainty } = *bearing;
         let range = prediction.range();
         let Some((_, sight)) = self.sights.iter_mut().find(|(name, _)| name == camera) else {
-            return self.see_first(bearing, speed / range, first_ratio);
+            return self.see_first(bearing, speed / range, ratio);
         };
         sight.predict(time, density / range.powi(2));
-        self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
+        self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0).min(ratio);
         // The shift by an uncertain clock is not known before the velocity is: use a typical speed.
         // Var = (v sd(t) / r)^2 per tangent.
         let clock = (speed * TYPICAL_SPEED * uncertainty.time_sd_s / range).powi(2);

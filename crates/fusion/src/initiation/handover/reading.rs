@@ -112,7 +112,7 @@ impl Reading {
         context: &ReadingContext<'_>,
         index: usize,
         expected: &TrackExpectation,
-        first_ratio: f64,
+        ratio: f64,
         rules: &Rules,
     ) -> Option<()> {
         let comparison = context.comparison;
@@ -124,11 +124,15 @@ impl Reading {
         let is_joint = self.track.residuals.iter().any(|(name, residual)| {
             *name != self.of.0 && name != camera && time.seconds_since(residual.time) < TOGETHER_S
         });
-        let first_ratio = if is_joint { 0.0 } else { first_ratio };
+        let first_ratio = if is_joint { 0.0 } else { ratio };
         match expected {
-            TrackExpectation::Near(prediction) => {
+            TrackExpectation::Near(prediction) if self.one_target.knows(camera) => {
                 let mobility = Mobility { density, speed: rules.speed };
-                self.one_target.see(&bearing, prediction, mobility, first_ratio);
+                self.one_target.see(&bearing, prediction, mobility, ratio);
+            }
+            TrackExpectation::Near(prediction) => {
+                let rate_sd = rules.speed / prediction.range();
+                self.one_target.see_first(&bearing, rate_sd, first_ratio);
             }
             TrackExpectation::Along { .. } if self.one_target.knows(camera) => {}
             TrackExpectation::Along { .. } => {
