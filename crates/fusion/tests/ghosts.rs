@@ -364,6 +364,6 @@ fn what_one_camera_follows_makes_no_target_with_clutter_of_another() {
         ghosts += confirmed.iter().sum::<usize>();
         looks += confirmed.len();
     }
-    // It was 93.
-    assert!(ghosts * 100 < looks, "{ghosts} ghosts in {looks} looks");
+    // There were 93.
+    assert!(ghosts * 400 < looks, "{ghosts} ghosts in {looks} looks");
 }

@@ -109,8 +109,8 @@ fn exact_poses_are_found_to_be_exact() {
     }
 }
 
-/// What image trackers say of all targets: each sits beside the middle of its target for good, is
-/// a good deal farther off for the first half second, and reports a variance that holds all of it.
+/// What image trackers say of all targets: each sits beside the middle of its target for good,
+/// within what it reports, and for the first half second it is a good deal farther off than that.
 fn followed(scene: &Scene, random: &mut ChaCha8Rng) -> Vec<BearingFrame> {
     let mut normal =
         |sd: f64| Vector2::from_fn(|_, _| -> f64 { StandardNormal.sample(random) }) * sd;

@@ -154,11 +154,6 @@ impl CameraState {
         self.noise.white().max(1.0)
     }
 
-    /// Whether it is known that part of its bearings' noise lasts from one to the next.
-    fn noise_lasts(&self) -> bool {
-        self.may_divide_noise && self.noise.white() < 1.0
-    }
-
     /// How far the camera is believed.
     pub(crate) fn standing(&self) -> Standing {
         if self.is_excluded() {

@@ -66,6 +66,8 @@ pub(crate) struct ScaleSample {
     /// Covariance of white noise per draw that averages out as slowly, rad^2: part of the noise
     /// lasts from one draw to the next, and `clock` is only as sure as the velocity.
     pub(crate) slow_noise: Matrix2<f64>,
+    /// Whether part of the noise was known to last.
+    pub(crate) noise_lasts: bool,
 }
 
 /// The squared pose error of a camera by one draw, in units of the declared deviation.

@@ -130,16 +130,16 @@ impl ErrorWatch {
         }
     }
 
-    /// Takes in whether it is known that part of a camera's noise lasts. What was learnt of its errors
+    /// Takes in whether part of a camera's noise is known to last. What was learnt of its errors
     /// before that was found is forgotten: such noise was taken to average out, and two lines of it
     /// passed for an error of the pose that no later line could disprove.
     fn note_noise(&mut self, place: usize, lasts: bool) {
         let camera = &mut self.cameras[place];
         if lasts && !camera.noise_lasts {
+            camera.noise_lasts = true;
             camera.watched_s = 0.0;
             self.memories.iter_mut().for_each(|memory| memory.forget(ERRORS * place, ERRORS));
         }
-        self.cameras[place].noise_lasts = lasts;
     }
 
     /// Discounts the memories by the time since the last draw.
@@ -226,8 +226,8 @@ impl ErrorWatch {
     }
 
     /// The least factor on the covariance of each pose whose deviation nobody has declared, by the
-    /// lines of the shorter memory: before it is known how much of a camera's noise lasts, that
-    /// passes for an error of its pose, and the longer memory would keep it for a minute.
+    /// lines of the shorter memory: errors of image trackers that last for seconds pass for errors
+    /// of a pose, and the longer memory would keep them for minutes.
     fn least_factors(
         &self,
         estimates: &[ErrorEstimate],
@@ -299,7 +299,7 @@ impl Cameras {
             let known = camera.known();
             let forward = Unit::new_normalize(known.camera.pose().rotation() * Vector3::z());
             let place = watch.place_of(&sample.camera, &known.pose_covariance, forward);
-            watch.note_noise(place, camera.noise_lasts());
+            watch.note_noise(place, sample.noise_lasts);
             places.push(place);
         }
         watch.learn(samples, &places, now);
@@ -346,6 +346,7 @@ mod tests {
                 by_pose: model.by_pose(),
                 clock: Vector2::zeros(),
                 slow_noise: Matrix2::identity() * 1e-8,
+                noise_lasts: false,
             }
         };
         vec![
@@ -426,6 +427,19 @@ mod tests {
             either.age(Timestamp::from_seconds(60.0 + 0.3 * f64::from(k)));
         }
         assert_eq!(chances(&either), [0.0; 2]);
+    }
+
+    #[test]
+    fn what_was_learnt_before_noise_was_known_to_last_is_forgotten_once() {
+        let turned = Vector3::new(5e-3, 0.0, 0.0);
+        let mut watch = watched(turned, 20.0);
+        watch.note_noise(0, true);
+        assert_eq!(chances(&watch), [0.0; 2]);
+        // What is learnt from then on stays, even if the noise is white for a while.
+        let (mut watch, before) = (watched(turned, 20.0), watched(turned, 20.0));
+        watch.cameras[0].noise_lasts = true;
+        [false, true].into_iter().for_each(|lasts| watch.note_noise(0, lasts));
+        assert_eq!(chances(&watch), chances(&before));
     }
 
     #[test]

@@ -58,7 +58,7 @@ struct Hypothesis {
     /// Whether each camera's newest line is of something that stands in its view.
     rooted: BTreeMap<CameraName, Rooted>,
     /// Log-likelihood ratio of each camera's lines and misses against clutter, given the lines of
-    /// the others; a seed's counts for each of its cameras.
+    /// the others; that of the seed as a whole counts for each of its cameras.
     evidence: BTreeMap<CameraName, f64>,
     /// Number of periods that gave it a line.
     periods: usize,
@@ -108,10 +108,10 @@ impl Hypothesis {
         self.rooted.get(camera).copied().unwrap_or_default()
     }
 
-    /// Whether enough cameras agree on it: three, or two for at least `pair_s` seconds. Lines of two
-    /// targets, each seen by another one of two cameras, may cross for a while; and what one camera
-    /// gave may be clutter, whatever the other one follows meanwhile: any line that lies near the
-    /// plane of the other's makes a target with it.
+    /// Whether enough cameras agree on it: three, or two for at least `pair_s` seconds. Lines of
+    /// two targets, each seen by another one of two cameras, may cross for a while; and what one
+    /// camera gave may be clutter, whatever the other one follows meanwhile: any line that lies
+    /// near the plane of the other's makes a target with it.
     fn agrees(&self, pair_s: f64, lines: &BTreeMap<&CameraName, [usize; 2]>) -> bool {
         let cameras = self.cameras();
         if cameras.len() >= 3 {

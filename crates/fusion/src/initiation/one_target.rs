@@ -28,7 +28,7 @@ pub(super) struct Mobility {
 }
 
 /// Log-likelihood ratio of all lines being one target's against every camera seeing a target of its
-/// own that no other camera sees.
+/// own that no other camera sees, or clutter.
 ///
 /// Against clutter, any line that continues smoothly is a target's. But if there are many targets
 /// that one camera each sees, their lines cross, and only how well the lines agree with one
@@ -102,8 +102,9 @@ impl OneTargetTest {
     }
 
     /// Adds a line that continues the target as predicted. `ratio` is its log-likelihood ratio
-    /// against clutter. A line that continues no object of its camera alone is clutter if it is not
-    /// the target's: it says no more for the target than that.
+    /// against clutter (where a target is handed over, against another thing in the view). It is
+    /// all that a camera's first line says, and no later one says more: what continues no object
+    /// that the camera alone sees may still be clutter.
     pub(super) fn see(
         &mut self,
         bearing: &TrackBearing<'_>,

@@ -165,6 +165,7 @@ impl Drawn {
             by_pose: self.by_pose,
             clock: self.clock,
             slow_noise: white + lasting + by_speed * by_speed.transpose(),
+            noise_lasts: self.lasting.sd_rad > 0.0,
         }
     }
 }

@@ -35,7 +35,7 @@ pub(super) struct Watched {
     /// The direction in which it looks.
     forward: Unit<Vector3<f64>>,
     pub(super) watched_s: f64,
-    /// Whether it is known that part of its noise lasts.
+    /// Whether part of its noise has ever been known to last.
     pub(super) noise_lasts: bool,
     /// When the camera was last seen beside others.
     drawn: Option<Timestamp>,
