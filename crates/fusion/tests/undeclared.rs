@@ -161,10 +161,11 @@ fn exact_poses_are_found_to_be_exact_by_what_image_trackers_say() {
     assert!(squares < 3.0, "{squares}");
 }
 
-/// Nor are poses that err as those of a careful survey taken for exact ones by that.
+/// Nor are poses that err as those of a careful survey taken for exact ones by that. It was 0.9 %
+/// of the answers of three cameras.
 #[test]
 fn a_lucky_pose_is_not_taken_for_an_exact_one_by_what_image_trackers_say() {
-    for cameras in [2, 3] {
+    for (cameras, most) in [(2, 0.02), (3, 0.005)] {
         let eyes = &site()[..cameras];
         let answers = (0..40).flat_map(|seed| {
             let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -173,6 +174,6 @@ fn a_lucky_pose_is_not_taken_for_an_exact_one_by_what_image_trackers_say() {
             answers_to(eyes, &scene, &frames)
         });
         let share = share_beyond(answers);
-        assert!(share < 0.02, "{cameras} cameras: {share} of the answers beyond four deviations");
+        assert!(share < most, "{cameras} cameras: {share} of the answers beyond four deviations");
     }
 }

@@ -46,6 +46,16 @@ const BOUNDS: HypothesisBounds =
 /// begin below zero: with half of it the first misses end a new target there.
 const LEAST_SCORE: f64 = -12.0;
 
+/// What a camera has said of a hypothesis.
+#[derive(Clone, Copy, Debug, Default)]
+struct Said {
+    /// Whether its newest line is of something that stands in its view.
+    rooted: Rooted,
+    /// Log-likelihood ratio of its lines and misses against clutter, given the lines of the other
+    /// cameras; that of the seed as a whole counts for each of its cameras.
+    evidence: f64,
+}
+
 /// One hypothesis: that these bearings are one target's.
 #[derive(Clone, Debug)]
 struct Hypothesis {
@@ -55,11 +65,8 @@ struct Hypothesis {
     track: Box<FusedTrack>,
     /// Its lines of the last periods, in order of time.
     lines: Vec<PeriodLine>,
-    /// Whether each camera's newest line is of something that stands in its view.
-    rooted: BTreeMap<CameraName, Rooted>,
-    /// Log-likelihood ratio of each camera's lines and misses against clutter, given the lines of
-    /// the others; that of the seed as a whole counts for each of its cameras.
-    evidence: BTreeMap<CameraName, f64>,
+    /// What each of its cameras has said.
+    said: BTreeMap<CameraName, Said>,
     /// Number of periods that gave it a line.
     periods: usize,
     born: Timestamp,
@@ -105,7 +112,7 @@ impl Hypothesis {
 
     /// Whether a camera's newest line is of something that stands in its view.
     fn rooted(&self, camera: &CameraName) -> Rooted {
-        self.rooted.get(camera).copied().unwrap_or_default()
+        self.said.get(camera).map_or_else(Rooted::default, |said| said.rooted)
     }
 
     /// Whether enough cameras agree on it: three, or two for at least `pair_s` seconds. Lines of
@@ -117,10 +124,9 @@ impl Hypothesis {
         if cameras.len() >= 3 {
             return true;
         }
-        let number = |camera: &CameraName| lines.get(camera).map_or(1, |[all, _]| *all).max(1);
-        let choices: f64 = cameras.iter().map(|camera| (number(camera) as f64).ln()).sum();
-        let least = BEYOND_DOUBT + choices;
-        cameras.iter().all(|camera| self.evidence.get(*camera).is_some_and(|own| *own >= least))
+        let choices: f64 = cameras.iter().map(|camera| log_number(lines, camera, true)).sum();
+        let is_sure = |said: &Said| said.evidence >= BEYOND_DOUBT + choices;
+        cameras.into_iter().all(|camera| self.said.get(camera).is_some_and(is_sure))
             && self.track.updated_at.seconds_since(self.born) >= pair_s
             && self.track.is_placed()
     }
@@ -159,10 +165,7 @@ impl Hypothesis {
         let moves = cameras.iter().any(|camera| self.rooted(camera) == Rooted::No);
         let choices = cameras.iter().map(|camera| {
             let may_stand = self.rooted(camera) == Rooted::Yes;
-            let all_count = may_stand && (cameras.len() > 2 || !moves);
-            let number = lines.get(camera);
-            let number = number.map_or(1, |[all, others]| if all_count { *all } else { *others });
-            (number.max(1) as f64).ln()
+            log_number(lines, camera, may_stand && (cameras.len() > 2 || !moves))
         });
         let mut least: f64 = choices.sum();
         let stands = self.rooted_cameras().is_some();
@@ -300,8 +303,8 @@ impl Hypotheses {
         if is_expected {
             // ln(1 - P(visible) P_D); against one target per camera, ln(1 - P_D) alone.
             hypothesis.track.score += miss;
-            if let Some(own) = hypothesis.evidence.get_mut(&comparison.exposure.camera) {
-                *own += miss;
+            if let Some(said) = hypothesis.said.get_mut(&comparison.exposure.camera) {
+                said.evidence += miss;
             }
             comparison.note(&mut hypothesis.track, false);
             let missed = log_missed(self.rules.detection);
@@ -323,14 +326,15 @@ impl Hypotheses {
         let density = motion.density(hypothesis.track.model_probabilities());
         comparison.take(&mut hypothesis.track, index)?;
         hypothesis.track.score += ratio;
-        *hypothesis.evidence.entry(exposure.camera.clone()).or_default() += ratio;
         if let Some(TrackExpectation::Near(prediction)) = prediction {
             let mobility = Mobility { density, speed: self.speed };
             hypothesis.one_target.see(&comparison.bearing(index), prediction, mobility, ratio);
         }
         let id = LineId::new(exposure, index);
         hypothesis.lines.push(PeriodLine { period: self.period, id });
-        hypothesis.rooted.insert(exposure.camera.clone(), exposure.sightings[index].rooted);
+        let said = hypothesis.said.entry(exposure.camera.clone()).or_default();
+        said.rooted = exposure.sightings[index].rooted;
+        said.evidence += ratio;
         Some(hypothesis)
     }
 
@@ -355,12 +359,10 @@ impl Hypotheses {
             track.score = seed.score;
             let place = fix.state.position();
             let mut one_target = OneTargetTest::begin(&seed.lines, place, self.speed, seed.score);
-            let mut rooted = BTreeMap::new();
-            let cameras = seed.lines.iter().map(|(LineId { camera, .. }, _)| camera.clone());
-            let evidence = cameras.map(|camera| (camera, seed.score)).collect();
+            let mut said = BTreeMap::new();
             for (id @ LineId { camera, .. }, timed) in &seed.lines {
                 let Some(own) = id.sighting_in(exposures) else { continue };
-                rooted.insert(camera.clone(), own.rooted);
+                said.insert(camera.clone(), Said { rooted: own.rooted, evidence: seed.score });
                 let expected = uncertainty.get(camera).and_then(|uncertainty| {
                     track.expectation(timed.time, camera, timed.line.origin, uncertainty, motion)
                 });
@@ -374,8 +376,7 @@ impl Hypotheses {
                 tree: self.trees,
                 track,
                 lines: lines.collect(),
-                rooted,
-                evidence,
+                said,
                 periods: 1,
                 born: time,
                 one_target,
@@ -449,6 +450,13 @@ impl Hypotheses {
             lines.filter_map(|line| self.provisional.get(&line.id)).copied().collect();
         NewTrack { track, cameras: hypothesis.cameras().len(), provisional_owners }
     }
+}
+
+/// Logarithm of a camera's number of lines: of all, or of those that may be of something that does
+/// not stand in its view.
+fn log_number(lines: &BTreeMap<&CameraName, [usize; 2]>, camera: &CameraName, all: bool) -> f64 {
+    let number = lines.get(camera).map_or(1, |[every, others]| if all { *every } else { *others });
+    (number.max(1) as f64).ln()
 }
 
 /// Number of lines of each camera in an exposure, the largest of the period: all, and those of

@@ -124,21 +124,18 @@ impl Reading {
         let is_joint = self.track.residuals.iter().any(|(name, residual)| {
             *name != self.of.0 && name != camera && time.seconds_since(residual.time) < TOGETHER_S
         });
-        let first_ratio = if is_joint { 0.0 } else { ratio };
+        let is_first = !self.one_target.knows(camera);
+        let ratio = if is_first && is_joint { 0.0 } else { ratio };
         match expected {
-            TrackExpectation::Near(prediction) if self.one_target.knows(camera) => {
+            TrackExpectation::Near(prediction) => {
                 let mobility = Mobility { density, speed: rules.speed };
                 self.one_target.see(&bearing, prediction, mobility, ratio);
             }
-            TrackExpectation::Near(prediction) => {
-                let rate_sd = rules.speed / prediction.range();
-                self.one_target.see_first(&bearing, rate_sd, first_ratio);
-            }
-            TrackExpectation::Along { .. } if self.one_target.knows(camera) => {}
-            TrackExpectation::Along { .. } => {
+            TrackExpectation::Along { .. } if is_first => {
                 let range = (self.track.state().position() - line.origin).norm();
-                self.one_target.see_first(&bearing, rules.speed / range, first_ratio);
+                self.one_target.see_first(&bearing, rules.speed / range, ratio);
             }
+            TrackExpectation::Along { .. } => {}
         }
         self.newest = LineId::new(comparison.exposure, index);
         Some(())
