@@ -100,13 +100,28 @@ struct Shared {
 
 #[derive(Debug, Default)]
 struct State {
-    frames: VecDeque<Frame>,
-    troubles: VecDeque<VideoError>,
+    /// Frames and troubles that wait to be fetched, in the order in which they came.
+    waiting: VecDeque<LiveEvent>,
     counts: LiveCounts,
     /// Set when this is dropped: no more frames are wanted, ...
     ended: bool,
     /// ... and set by the camera's thread once it has closed the session.
     left: bool,
+}
+
+impl State {
+    /// Number of frames that wait.
+    fn frames(&self) -> usize {
+        self.waiting.iter().filter(|event| matches!(event, LiveEvent::Frame(_))).count()
+    }
+
+    /// Discards the oldest frame.
+    fn leave_one_out(&mut self) {
+        let oldest = self.waiting.iter().position(|event| matches!(event, LiveEvent::Frame(_)));
+        if oldest.and_then(|oldest| self.waiting.remove(oldest)).is_some() {
+            self.counts.left_out += 1;
+        }
+    }
 }
 
 impl Shared {
@@ -121,10 +136,9 @@ impl Shared {
 
     fn give(&self, frame: Frame) {
         let mut state = self.locked();
-        state.frames.push_back(frame);
-        if state.frames.len() > WAITING {
-            state.frames.pop_front();
-            state.counts.left_out += 1;
+        state.waiting.push_back(LiveEvent::Frame(frame));
+        if state.frames() > WAITING {
+            state.leave_one_out();
         }
         drop(state);
         self.changed.notify_all();
@@ -132,8 +146,8 @@ impl Shared {
 
     fn complain(&self, trouble: VideoError) {
         let mut state = self.locked();
-        if state.troubles.len() < TROUBLES {
-            state.troubles.push_back(trouble);
+        if state.waiting.len() - state.frames() < TROUBLES {
+            state.waiting.push_back(LiveEvent::Trouble(trouble));
         }
         drop(state);
         self.changed.notify_all();
@@ -165,16 +179,13 @@ impl Live {
         Self { shared }
     }
 
-    /// The next trouble or frame; waits for `patience` at most. Troubles come before frames.
+    /// The next trouble or frame, in the order in which they came; waits for `patience` at most.
     pub fn next(&self, patience: Duration) -> LiveEvent {
         let until = Instant::now() + patience;
         let mut state = self.shared.locked();
         loop {
-            if let Some(trouble) = state.troubles.pop_front() {
-                return LiveEvent::Trouble(trouble);
-            }
-            if let Some(frame) = state.frames.pop_front() {
-                return LiveEvent::Frame(frame);
+            if let Some(event) = state.waiting.pop_front() {
+                return event;
             }
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {

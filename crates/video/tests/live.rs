@@ -147,6 +147,18 @@ fn within(live: &Live, seconds: f64) -> (Vec<Frame>, Vec<VideoError>) {
     (frames, troubles)
 }
 
+/// A frame of one pixel.
+fn a_frame(index: u64) -> Frame {
+    Frame {
+        index,
+        capture: CaptureTime { time: Timestamp::EPOCH, sd_s: 0.0 },
+        live: None,
+        width: 1,
+        height: 1,
+        pixels: Pixels::Gray8(vec![0]),
+    }
+}
+
 /// What is said first when a camera is opened.
 fn refused(options: RtspOptions) -> String {
     match watched(options).next(Duration::from_secs(10)) {
@@ -316,20 +328,37 @@ fn a_reader_that_fails_is_begun_anew_and_numbers_go_on() {
         fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
             assert!(self.0 < 5, "it fails on purpose");
             self.0 += 1;
-            Ok(Some(Frame {
-                index: self.0 - 1,
-                capture: CaptureTime { time: Timestamp::EPOCH, sd_s: 0.0 },
-                live: None,
-                width: 1,
-                height: 1,
-                pixels: Pixels::Gray8(vec![0]),
-            }))
+            Ok(Some(a_frame(self.0 - 1)))
         }
     }
     let live = Live::start(|_| Ok(Box::new(Failing(0))));
     let (frames, troubles) = within(&live, 2.0);
     assert!(troubles.len() >= 2, "{troubles:?}");
     assert!(frames.windows(2).all(|f| f[1].index > f[0].index), "{frames:?}");
+}
+
+/// What a camera has shown before it is lost does not look like one that is back.
+#[test]
+fn what_is_fetched_late_comes_in_its_order() {
+    struct Ending(u64);
+    impl FrameSource for Ending {
+        fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+            self.0 += 1;
+            Ok((self.0 <= 3).then(|| a_frame(self.0 - 1)))
+        }
+    }
+    let live = Live::start(|_| Ok(Box::new(Ending(0))));
+    let begun = Instant::now();
+    while live.counts().opened < 2 {
+        assert!(begun.elapsed() < Duration::from_secs(10), "{:?}", live.counts());
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    for index in 0..3 {
+        let event = live.next(Duration::ZERO);
+        assert!(matches!(&event, LiveEvent::Frame(frame) if frame.index == index), "{event:?}");
+    }
+    let event = live.next(Duration::ZERO);
+    assert!(matches!(event, LiveEvent::Trouble(VideoError::Ended)), "{event:?}");
 }
 
 #[test]
