@@ -92,10 +92,9 @@ impl Reacquisition {
         tracks: &BTreeMap<TrackId, FusedTrack>,
         exposure: &OwnedExposure<'_>,
     ) -> Vec<(FusedTrack, Option<usize>)> {
-        self.leaves.retain(|id, _| tracks.get(id).is_some_and(|track| !track.is_triangulated()));
+        self.leaves.retain(|id, _| tracks.get(id).is_some_and(|track| !track.is_ranged()));
         let mut found = Vec::new();
-        let alone =
-            tracks.values().filter(|track| track.is_confirmed() && !track.is_triangulated());
+        let alone = tracks.values().filter(|track| track.is_confirmed() && !track.is_ranged());
         for track in alone {
             let before = self.leaves.remove(&track.id).unwrap_or_default();
             let mut next: Vec<_> =

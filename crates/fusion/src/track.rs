@@ -22,7 +22,7 @@ use std::fmt;
 use crossfix_filter::{Imm, KinematicState};
 use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::{CameraName, Cued, Solver, Timestamp, TrackNumber};
-use nalgebra::{Matrix2, Matrix2x6, Matrix6, Point3};
+use nalgebra::{Matrix2, Matrix2x6, Matrix6, Point3, Vector3};
 
 use crate::cameras::ThirdDifferences;
 use crate::cueing::CueTarget;
@@ -316,19 +316,24 @@ impl FusedTrack {
         self.ties.iter().filter(|(name, ties)| lately(ties) && *name != camera).count()
     }
 
-    /// Whether a camera has lately given the track a bearing.
-    fn is_followed_by(&self, camera: &CameraName) -> bool {
-        self.ties
-            .get(camera)
-            .is_some_and(|ties| ties.has_seen_lately(self.updated_at, self.holding_s))
+    /// Whether no two cameras see the target now, and this one does not: any line of it that crosses
+    /// the sight line of the other would pass for the target.
+    pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName) -> bool {
+        let sees = |ties: &Ties| ties.sees(self.updated_at, self.holding_s);
+        !self.ranged && !self.ties.get(camera).is_some_and(sees)
     }
 
-    /// Whether the track is too uncertain to be associated directly with a camera that has not been
-    /// following it: any line that crosses the other camera's sight line would pass for its target.
-    pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName) -> bool {
-        !self.triangulated
-            && !self.is_followed_by(camera)
-            && self.position_sd() > MAX_PAIR_SHARE * self.range()
+    /// The vector of one standard deviation of the range from the camera that gave the newest
+    /// bearing, m.
+    pub(crate) fn range_deviation(&self) -> Vector3<f64> {
+        let along =
+            |origin| (self.state().position() - origin) * log_range_sd(self.state(), origin);
+        self.follower.map_or_else(Vector3::zeros, along)
+    }
+
+    /// Whether two cameras see the target now, and so its range.
+    pub(crate) fn is_ranged(&self) -> bool {
+        self.ranged
     }
 
     /// Whether the track is only a direction: one camera alone sees the target, and the range is
@@ -369,6 +374,14 @@ impl FusedTrack {
         let holding_s = self.holding_s;
         if let Some(ties) = self.ties.get_mut(camera) {
             ties.visibility.update(time, seen, detection, holding_s);
+        }
+    }
+
+    /// Notes that the target was outside a camera's view.
+    pub(crate) fn note_out_of_view(&mut self, camera: &CameraName, time: Timestamp) {
+        self.note(camera, time);
+        if let Some(ties) = self.ties.get_mut(camera) {
+            ties.visibility.hide(time);
         }
     }
 

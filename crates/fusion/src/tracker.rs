@@ -64,6 +64,8 @@ struct Noted {
     changes: Vec<TrackChange>,
     fittings: Fittings,
     third_differences: Vec<ThirdDifferences>,
+    /// Tracks that none of its bearings was assigned to.
+    unseen: Vec<TrackId>,
 }
 
 /// A sighting that a track has used.
@@ -263,8 +265,9 @@ impl Tracker {
             self.associate(exposure, known, &ids, &mut owners, &mut noted);
         }
         self.note_beside(exposure, known, &owners);
-        let Noted { mut changes, fittings, third_differences } = noted;
+        let Noted { mut changes, fittings, third_differences, unseen } = noted;
         self.reacquire(exposure, known, &mut owners);
+        self.note_unseen(exposure, known, &owners, &unseen);
         let used = owners
             .iter()
             .enumerate()

@@ -66,6 +66,11 @@ impl Visibility {
         self.time = self.time.plus_seconds(step_s);
     }
 
+    /// Takes in an exposure in whose view the target was not.
+    pub(crate) fn hide(&mut self, time: Timestamp) {
+        (self.visible, self.time) = (0.0, time);
+    }
+
     /// Takes in an exposure that has shown the target or not; `detection` is the probability that
     /// the camera reports a target that is visible.
     pub(crate) fn update(&mut self, time: Timestamp, seen: bool, detection: f64, holding_s: f64) {

@@ -78,12 +78,29 @@ impl Tracker {
             let evidence = Evidence { gain, sees, sure };
             let change = evidence.score_change(track, &comparison, self.config.coasting_after_s);
             track.add_evidence(change, MAX_SCORE);
-            // A camera misses nothing outside its field of view.
-            if gain.is_some() || sees {
-                comparison.note(track, gain.is_some());
+            if gain.is_some() {
+                comparison.note(track, true);
+            } else {
+                noted.unseen.push(*id);
             }
             if taken.is_some_and(|taken| taken.manoeuvre) {
                 noted.changes.push(TrackChange::new(TrackEventKind::Manoeuvre, *id));
+            }
+        }
+    }
+
+    /// Notes that an exposure, whose bearings now have these owners, shows nothing of these tracks.
+    pub(super) fn note_unseen(
+        &mut self,
+        exposure: &Exposure,
+        known: &KnownCamera,
+        owners: &[Option<TrackId>],
+        unseen: &[TrackId],
+    ) {
+        let comparison = Comparison { exposure, known, motion: &self.motion, rules: self.rules };
+        for id in unseen.iter().filter(|id| !owners.contains(&Some(**id))) {
+            if let Some(track) = self.tracks.get_mut(id) {
+                comparison.note_unseen(track);
             }
         }
     }
@@ -122,9 +139,6 @@ impl Tracker {
         owners: &[Option<TrackId>],
         ids: &[TrackId],
     ) -> Vec<Pairing> {
-        // Least log-density of a bearing that is to update a track which this camera has lost sight
-        // of.
-        let least_log_density = exposure.clutter_per_sr.ln() + BEYOND_DOUBT;
         let origin = known.camera.pose().position();
         let comparison = self.comparison(exposure, known);
         let mut pairings = Vec::new();
@@ -140,7 +154,7 @@ impl Tracker {
             let missed = comparison.log_missed(track);
             let lost_sight = track.is_lost_sight_of_by(&exposure.camera);
             let near = comparison.candidates(track, &expected, |index| owners[index].is_none());
-            let near = near.filter(|one| !lost_sight || one.fit.log_density > least_log_density);
+            let near = near.filter(|one| !lost_sight || one.ratio > BEYOND_DOUBT);
             pairings.extend(near.map(|Candidate { index, ratio, .. }| Pairing {
                 row,
                 column: index,
