@@ -10,11 +10,6 @@ use crate::track::{FusedTrack, Taken, TrackBearing, TrackExpectation};
 use crate::visibility::log_missed;
 use crate::{Exposure, FusionConfig};
 
-/// A target is taken to be within this many standard deviations of its range. With half of it one
-/// in three is hidden from a camera in whose view it is, until that has seen it twice; with twice
-/// as much, false bearings at the border of a view are taken for a target that flies beside it.
-const WITHIN_SD: f64 = 2.0;
-
 /// What all comparisons go by, from the site's configuration.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ComparisonRules {
@@ -124,22 +119,20 @@ impl<'a> Comparison<'a> {
         track.note_visibility(camera, *time, seen, self.rules.detection);
     }
 
-    /// Whether the track's target may be in the camera's view, though it is not expected there:
-    /// where one camera alone sees it, its range is all that is uncertain.
-    fn may_see(&self, track: &FusedTrack) -> bool {
-        let place = track.position_at(self.exposure.time);
-        let ends = track.range_deviation() * WITHIN_SD;
-        let expects = |place| self.known.expects(place, self.rules.max_range_m);
-        expects(place - ends) || expects(place + ends)
-    }
-
     /// Notes that the camera has not reported the track's target: it has missed it in its view, and
-    /// sees nothing outside of that.
+    /// sees nothing outside of that. A camera that turns has no view.
     pub(crate) fn note_unseen(&self, track: &mut FusedTrack) {
+        if self.known.is_turning {
+            return;
+        }
         if self.expects(track) {
             self.note(track, false);
-        } else if !self.may_see(track) {
-            track.note_out_of_view(&self.exposure.camera, self.exposure.time);
+            return;
+        }
+        let Exposure { camera, time, .. } = self.exposure;
+        let expects = |place| self.known.expects(place, self.rules.max_range_m);
+        if !track.places_along(*time, self.motion).any(expects) {
+            track.note_out_of_view(camera, *time);
         }
     }
 }

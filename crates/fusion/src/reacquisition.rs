@@ -1,5 +1,5 @@
-//! Re-acquisition: a second camera sees the target of a track that one camera alone follows. Any of
-//! its bearings that crosses the sight line may be the target's, so each is followed as a
+//! Re-acquisition: a camera sees the target of a track that no two cameras see. Any of its bearings
+//! that crosses the sight line of the last one may be the target's, so each is followed as a
 //! hypothesis of its own (a leaf) until one is sure. All others, of other objects or of nothing,
 //! are clutter.
 
@@ -25,7 +25,7 @@ struct Leaf {
     log_ratio: f64,
 }
 
-/// The leaves of all tracks that one camera alone follows.
+/// The leaves of all tracks that no two cameras see.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Reacquisition {
     leaves: BTreeMap<TrackId, Vec<Leaf>>,
@@ -85,7 +85,7 @@ impl OwnedExposure<'_> {
 }
 
 impl Reacquisition {
-    /// Continues the leaves of all tracks that one camera alone follows; returns the tracks that
+    /// Continues the leaves of all tracks that no two cameras see; returns the tracks that
     /// are found again, with the bearing (by index) that has settled it.
     pub(crate) fn advance(
         &mut self,

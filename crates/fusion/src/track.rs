@@ -22,7 +22,7 @@ use std::fmt;
 use crossfix_filter::{Imm, KinematicState};
 use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::{CameraName, Cued, Solver, Timestamp, TrackNumber};
-use nalgebra::{Matrix2, Matrix2x6, Matrix6, Point3, Vector3};
+use nalgebra::{Matrix2, Matrix2x6, Matrix6, Point3};
 
 use crate::cameras::ThirdDifferences;
 use crate::cueing::CueTarget;
@@ -46,6 +46,11 @@ use ties::Ties;
 /// targets cross too. With half of it the lines of two cameras must cross at twice the angle, and
 /// targets that are far away are found later.
 const MAX_PAIR_SHARE: f64 = 0.03;
+/// Deviations of the logarithm of the range at which a target is looked for in a view. With half of
+/// them one in three is hidden from a camera in whose view it is, until that has seen it twice; with
+/// twice as much, false bearings at the border of a view are taken for a target that flies beside
+/// it.
+const RANGE_DEVIATIONS: [f64; 4] = [-2.0, -1.0, 1.0, 2.0];
 /// Identity of a 3D track, unique across restarts: see [`crossfix_message::track_id`]. Displayed as
 /// the track's number within its run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -316,22 +321,30 @@ impl FusedTrack {
         self.ties.iter().filter(|(name, ties)| lately(ties) && *name != camera).count()
     }
 
-    /// Whether no two cameras see the target now, and this one does not: any line of it that crosses
-    /// the sight line of the other would pass for the target.
+    /// Whether no two cameras saw the target at its newest bearing, and this one did not: any line of
+    /// it that crosses the sight line of the other would pass for the target.
     pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName) -> bool {
         let sees = |ties: &Ties| ties.sees(self.updated_at, self.holding_s);
         !self.ranged && !self.ties.get(camera).is_some_and(sees)
     }
 
-    /// The vector of one standard deviation of the range from the camera that gave the newest
-    /// bearing, m.
-    pub(crate) fn range_deviation(&self) -> Vector3<f64> {
-        let along =
-            |origin| (self.state().position() - origin) * log_range_sd(self.state(), origin);
-        self.follower.map_or_else(Vector3::zeros, along)
+    /// Where the target may be at a time beside where it is expected: where one camera alone sees
+    /// it, anywhere along that one's sight line within two standard deviations of the logarithm of
+    /// the range.
+    pub(crate) fn places_along(
+        &self,
+        time: Timestamp,
+        motion: &MotionSetup,
+    ) -> impl Iterator<Item = Point3<f64>> {
+        let along = self.alone().map(|origin| {
+            let state = self.predicted(time, motion);
+            let (away, sd) = (state.position() - origin, log_range_sd(&state, origin));
+            RANGE_DEVIATIONS.map(|deviations| origin + away * (deviations * sd).exp())
+        });
+        along.into_iter().flatten()
     }
 
-    /// Whether two cameras see the target now, and so its range.
+    /// Whether two cameras saw the target at its newest bearing, and so its range.
     pub(crate) fn is_ranged(&self) -> bool {
         self.ranged
     }
@@ -377,9 +390,8 @@ impl FusedTrack {
         }
     }
 
-    /// Notes that the target was outside a camera's view.
+    /// Notes that the target was outside a camera's view, where that has had it in its view before.
     pub(crate) fn note_out_of_view(&mut self, camera: &CameraName, time: Timestamp) {
-        self.note(camera, time);
         if let Some(ties) = self.ties.get_mut(camera) {
             ties.visibility.hide(time);
         }

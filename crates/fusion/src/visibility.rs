@@ -21,6 +21,10 @@ const HIDDEN: f64 = 0.075;
 /// less against a ghost.
 const APPEARS: f64 = 0.75;
 
+/// Probability that a target is in a camera's view after all where that does not reach: by errors
+/// of pose and lens at its border. With half of it the same: it comes into sight by the rate above.
+const OUT_OF_VIEW: f64 = 1e-3;
+
 /// Log-likelihood ratio of a missed report, for a target that the camera reports with probability
 /// `detection`.
 pub(crate) fn log_missed(detection: f64) -> f64 {
@@ -68,7 +72,7 @@ impl Visibility {
 
     /// Takes in an exposure in whose view the target was not.
     pub(crate) fn hide(&mut self, time: Timestamp) {
-        (self.visible, self.time) = (0.0, time);
+        (self.visible, self.time) = (OUT_OF_VIEW, time);
     }
 
     /// Takes in an exposure that has shown the target or not; `detection` is the probability that

@@ -10,7 +10,8 @@ use common::{Eye, Path, Scene, eye, found, fusion_of};
 use crossfix_fusion::{FusionConfig, TrackStatus};
 use nalgebra::Point3;
 
-/// A camera that follows what flies away from it, and five quick ones on both sides of its path. They report two thirds of what they see, and two false bearings an image.
+/// A camera that follows what flies away from it, and five quick ones on both sides of its path.
+/// They report two thirds of what they see, and two false bearings an image.
 fn scene(path: Path, seconds: f64) -> Scene {
     let mut eyes = vec![eye("follower", [-150.0, -20.0, 2.0], [0.0, 0.0, 40.0], 0.0)];
     for (k, angle) in [1.3_f64, 1.5, 1.7, -1.4, -1.6].into_iter().enumerate() {
@@ -71,7 +72,7 @@ fn a_false_bearing_in_a_view_that_the_target_has_left_is_not_taken_for_it() {
     assert!(beyond * 1000 < answers, "{beyond} of {answers} beyond four deviations");
 }
 
-/// Nor is it missed for that when it comes back: two frames of a camera settle it.
+/// A target that comes back into a view is taken up again within 0.3 s, though it was hidden there.
 #[test]
 fn a_target_that_comes_back_into_a_view_is_known_there_at_once() {
     for seed in 0..20 {

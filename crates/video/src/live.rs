@@ -34,8 +34,8 @@ const LEAVE: Duration = Duration::from_millis(400);
 /// waited longer is of no use for where something is now. With half of it a program that stops for
 /// three frames loses one; with twice as much frames may be a quarter of a second old at 30 Hz.
 const WAITING: usize = 4;
-/// Troubles that may wait to be fetched. With half of it the same: what comes beyond is dropped,
-/// and the first ones say why.
+/// Troubles that may wait to be fetched. With half of it the same: bad frames beyond it are not
+/// said, and the first ones say why.
 const TROUBLES: usize = 64;
 
 /// What a live camera shows at the moment.
@@ -111,7 +111,7 @@ struct State {
 
 impl State {
     /// Number of frames that wait.
-    fn frames(&self) -> usize {
+    fn frames_waiting(&self) -> usize {
         self.waiting.iter().filter(|event| matches!(event, LiveEvent::Frame(_))).count()
     }
 
@@ -137,7 +137,7 @@ impl Shared {
     fn give(&self, frame: Frame) {
         let mut state = self.locked();
         state.waiting.push_back(LiveEvent::Frame(frame));
-        if state.frames() > WAITING {
+        if state.frames_waiting() > WAITING {
             state.leave_one_out();
         }
         drop(state);
@@ -146,9 +146,16 @@ impl Shared {
 
     fn complain(&self, trouble: VideoError) {
         let mut state = self.locked();
-        if state.waiting.len() - state.frames() < TROUBLES {
-            state.waiting.push_back(LiveEvent::Trouble(trouble));
+        let is_full = state.waiting.len() - state.frames_waiting() >= TROUBLES;
+        if is_full && trouble.is_one_frame() {
+            return;
         }
+        // That the camera is lost is said in place of one more bad frame.
+        let is_trouble = |event: &LiveEvent| matches!(event, LiveEvent::Trouble(_));
+        if is_full && let Some(newest) = state.waiting.iter().rposition(is_trouble) {
+            state.waiting.remove(newest);
+        }
+        state.waiting.push_back(LiveEvent::Trouble(trouble));
         drop(state);
         self.changed.notify_all();
     }

@@ -6,7 +6,14 @@
 //! cargo run --release -p crossfix-fusion --example drawn_sites -- --first 1000 --sites 60
 //! ```
 //!
-//! `--cameras N`, `--targets N` and `--poses exact|careful|declared` fix what else is drawn;
+//! A row for each kind of poses: number of sites; the share of looks at targets that two cameras have
+//! in view, four times a second after the fifth second, in which they have a track; the share of
+//! answers (confirmed tracks, where they were at their newest bearing) beyond four stated deviations,
+//! and of those that are also 5 m or more from every target; the median NEES of the position, 2.37
+//! where covariances are right; the median error. The first seed is 1 and there are 60 sites if
+//! nothing else is asked for.
+//!
+//! `--cameras N`, `--targets N` and `--poses exact|careful|declared` set what is otherwise drawn;
 //! `--each` adds a line for each site. A change to the fusion is tried on seeds that it was not made
 //! with.
 
@@ -81,18 +88,18 @@ fn fuse(site: &mut DrawnSite) -> Result<Tally, Box<dyn Error>> {
 fn run() -> Result<(), Box<dyn Error>> {
     let wishes = Wishes::of(std::env::args().skip(1))?;
     let mut all: BTreeMap<Poses, Tally> = BTreeMap::new();
-    println!("{:<10} {:>4}  {}", "poses", "", Tally::HEADING);
+    println!("{:<10} {:>6}  {}", "poses", "", Tally::HEADING);
     for seed in wishes.first..wishes.first + wishes.sites {
         let mut site = DrawnSite::draw(seed, &wishes)?;
         let tally = fuse(&mut site)?;
         if wishes.each {
             let poses = format!("{:?}", site.poses);
-            println!("{poses:<10} {seed:>4}  {tally}  {site}");
+            println!("{poses:<10} {seed:>6}  {tally}  {site}");
         }
         all.entry(site.poses).or_default().add(tally);
     }
     for (poses, tally) in all {
-        println!("{:<10} {:>4}  {tally}", format!("{poses:?}"), "all");
+        println!("{:<10} {:>6}  {tally}", format!("{poses:?}"), "all");
     }
     Ok(())
 }

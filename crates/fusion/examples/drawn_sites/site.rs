@@ -95,7 +95,7 @@ impl Flight {
     fn draw(middle: Point3<f64>, radius_m: f64, random: &mut ChaCha8Rng) -> Self {
         let reach_m = 0.3 * radius_m;
         let around = middle + Vector3::from_fn(|_, _| random.random_range(-0.5..0.5)) * reach_m;
-        // No faster than crosses the site in ten seconds, nor than such targets fly.
+        // No faster than from the middle to the cameras in ten seconds, nor than such targets fly.
         let speed = random.random_range(0.02..0.1) * radius_m.min(300.0);
         match random.random_range(0..4) {
             0 => {
@@ -157,7 +157,8 @@ pub struct DrawnSite {
 }
 
 impl DrawnSite {
-    /// The site of a seed; what is wished is not drawn.
+    /// The site of a seed, with what is wished in place of what is drawn: with other poses it is the
+    /// same site.
     pub fn draw(seed: u64, wishes: &Wishes) -> Result<Self, GeometryError> {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let poses = Poses::ALL[random.random_range(0..3)];

@@ -31,15 +31,16 @@ pub struct Tally {
     answers: usize,
     beyond: usize,
     elsewhere: usize,
-    /// Squared error of each answer by its covariance: three on average where it is right.
+    /// Squared error of the position in each answer by its covariance (NEES). Half of them are above
+    /// 2.37 where the covariance is right.
     squares: Vec<f64>,
-    /// Squared errors, m², of those on a target.
+    /// Errors of those on a target, m.
     errors: Vec<f64>,
 }
 
 impl Tally {
     /// Names of the columns.
-    pub const HEADING: &str = "sites  found  beyond  elsewhere  NEES(3)  error, m";
+    pub const HEADING: &str = "sites   found  beyond   elsewhere     NEES  error, m";
 
     /// Looks at the tracks, where it is time to.
     pub fn look(&mut self, fusion: &Fusion, site: &DrawnSite) {
@@ -82,7 +83,7 @@ impl Tally {
             self.elsewhere += 1;
             return None;
         }
-        self.errors.push(error * error);
+        self.errors.push(error);
         Some(index)
     }
 
@@ -117,7 +118,7 @@ impl fmt::Display for Tally {
             100.0 * share(self.beyond, self.answers),
             100.0 * share(self.elsewhere, self.answers),
             median(&self.squares),
-            median(&self.errors).sqrt(),
+            median(&self.errors),
         )
     }
 }

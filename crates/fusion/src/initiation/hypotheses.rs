@@ -119,12 +119,13 @@ impl Hypothesis {
     /// two targets, each seen by another one of two cameras, may cross for a while; and what one
     /// camera gave may be clutter, whatever the other one follows meanwhile: any line that lies
     /// near the plane of the other's makes a target with it.
-    fn agrees(&self, pair_s: f64, lines: &BTreeMap<&CameraName, [usize; 2]>) -> bool {
+    fn agrees(&self, pair_s: f64, lines: &BTreeMap<&CameraName, LineCounts>) -> bool {
         let cameras = self.cameras();
         if cameras.len() >= 3 {
             return true;
         }
-        let choices: f64 = cameras.iter().map(|camera| log_number(lines, camera, true)).sum();
+        let all = |camera: &&CameraName| lines.get(*camera).map_or(1, |counts| counts.all);
+        let choices: f64 = cameras.iter().map(|camera| log_number(all(camera))).sum();
         let is_sure = |said: &Said| said.evidence >= BEYOND_DOUBT + choices;
         cameras.into_iter().all(|camera| self.said.get(camera).is_some_and(is_sure))
             && self.track.updated_at.seconds_since(self.born) >= pair_s
@@ -160,12 +161,14 @@ impl Hypothesis {
     /// what is disputed: a third camera would have to miss a target that it should see. Else, if
     /// none of its lines has been seen to come or to move, all may stand, and it needs as much more
     /// as against any other rival.
-    fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, [usize; 2]>) -> f64 {
+    fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, LineCounts>) -> f64 {
         let cameras = self.cameras();
         let moves = cameras.iter().any(|camera| self.rooted(camera) == Rooted::No);
         let choices = cameras.iter().map(|camera| {
             let may_stand = self.rooted(camera) == Rooted::Yes;
-            log_number(lines, camera, may_stand && (cameras.len() > 2 || !moves))
+            let count_all = may_stand && (cameras.len() > 2 || !moves);
+            let number = |counts: &LineCounts| if count_all { counts.all } else { counts.others };
+            log_number(lines.get(camera).map_or(1, number))
         });
         let mut least: f64 = choices.sum();
         let stands = self.rooted_cameras().is_some();
@@ -391,7 +394,7 @@ impl Hypotheses {
     fn confirm(
         &mut self,
         now: Timestamp,
-        lines: &BTreeMap<&CameraName, [usize; 2]>,
+        lines: &BTreeMap<&CameraName, LineCounts>,
         motion: &MotionSetup,
     ) -> Vec<NewTrack> {
         // Sorted by score: the rest have scores of 0 and less, which are never chosen.
@@ -431,7 +434,7 @@ impl Hypotheses {
     fn is_likely(
         &self,
         hypothesis: &Hypothesis,
-        lines: &BTreeMap<&CameraName, [usize; 2]>,
+        lines: &BTreeMap<&CameraName, LineCounts>,
     ) -> bool {
         let least = hypothesis.least_one_target_ratio(lines);
         let is_one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= least);
@@ -452,22 +455,27 @@ impl Hypotheses {
     }
 }
 
-/// Logarithm of a camera's number of lines: of all, or of those that may be of something that does
-/// not stand in its view.
-fn log_number(lines: &BTreeMap<&CameraName, [usize; 2]>, camera: &CameraName, all: bool) -> f64 {
-    let number = lines.get(camera).map_or(1, |[every, others]| if all { *every } else { *others });
-    (number.max(1) as f64).ln()
+/// Numbers of lines of a camera in an exposure.
+#[derive(Clone, Copy, Debug, Default)]
+struct LineCounts {
+    all: usize,
+    /// Those of which it is not known that they are of something that stands in its view.
+    others: usize,
 }
 
-/// Number of lines of each camera in an exposure, the largest of the period: all, and those of
-/// which it is not known that they are of something that stands in its view.
-fn numbers_of_lines<'a>(exposures: &[&'a Exposure]) -> BTreeMap<&'a CameraName, [usize; 2]> {
-    let mut lines: BTreeMap<&CameraName, [usize; 2]> = BTreeMap::new();
+/// Logarithm of a number of lines, of which there is at least one.
+fn log_number(lines: usize) -> f64 {
+    (lines.max(1) as f64).ln()
+}
+
+/// Numbers of lines of each camera in an exposure, the largest of the period.
+fn numbers_of_lines<'a>(exposures: &[&'a Exposure]) -> BTreeMap<&'a CameraName, LineCounts> {
+    let mut lines: BTreeMap<&CameraName, LineCounts> = BTreeMap::new();
     for exposure in exposures {
         let others = exposure.sightings.iter().filter(|sighting| sighting.rooted != Rooted::Yes);
-        let now = [exposure.sightings.len(), others.count()];
         let most = lines.entry(&exposure.camera).or_default();
-        *most = [0, 1].map(|i: usize| most[i].max(now[i]));
+        most.all = most.all.max(exposure.sightings.len());
+        most.others = most.others.max(others.count());
     }
     lines
 }

@@ -392,6 +392,8 @@ impl FusedTrack {
         let learns = self.learns(camera);
         if let Some(ties) = self.ties.get_mut(camera) {
             ties.recent = RecentBearings::default();
+            // What was outside its view may be in it now.
+            ties.visibility = Visibility::new(ties.visibility.last_exposure());
             if !learns {
                 ties.covariance.fixed_columns_mut::<2>(LASTING).fill(0.0);
                 ties.learnt.fixed_columns_mut::<2>(LASTING).fill(0.0);
