@@ -47,9 +47,9 @@ use ties::Ties;
 /// targets that are far away are found later.
 const MAX_PAIR_SHARE: f64 = 0.03;
 /// Deviations of the logarithm of the range at which a target is looked for in a view. With half of
-/// them one in three is hidden from a camera in whose view it is, until that has seen it twice; with
-/// twice as much, false bearings at the border of a view are taken for a target that flies beside
-/// it.
+/// them one in three is hidden from a camera in whose view it is, until that has seen it twice;
+/// with twice as much, false bearings at the border of a view are taken for a target that flies
+/// beside it.
 const RANGE_DEVIATIONS: [f64; 4] = [-2.0, -1.0, 1.0, 2.0];
 /// Identity of a 3D track, unique across restarts: see [`crossfix_message::track_id`]. Displayed as
 /// the track's number within its run.
@@ -321,8 +321,8 @@ impl FusedTrack {
         self.ties.iter().filter(|(name, ties)| lately(ties) && *name != camera).count()
     }
 
-    /// Whether no two cameras saw the target at its newest bearing, and this one did not: any line of
-    /// it that crosses the sight line of the other would pass for the target.
+    /// Whether no two cameras saw the target at its newest bearing, and this one did not: any line
+    /// of it that crosses the sight line of the other would pass for the target.
     pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName) -> bool {
         let sees = |ties: &Ties| ties.sees(self.updated_at, self.holding_s);
         !self.ranged && !self.ties.get(camera).is_some_and(sees)

@@ -6,16 +6,16 @@
 //! cargo run --release -p crossfix-fusion --example drawn_sites -- --first 1000 --sites 60
 //! ```
 //!
-//! A row for each kind of poses: number of sites; the share of looks at targets that two cameras have
-//! in view, four times a second after the fifth second, in which they have a track; the share of
-//! answers (confirmed tracks, where they were at their newest bearing) beyond four stated deviations,
-//! and of those that are also 5 m or more from every target; the median NEES of the position, 2.37
-//! where covariances are right; the median error. The first seed is 1 and there are 60 sites if
-//! nothing else is asked for.
+//! A row for each kind of poses: number of sites; the share of looks at targets that two cameras
+//! have in view, four times a second after the fifth second, in which they have a track; the share
+//! of answers (confirmed tracks, where they were at their newest bearing) beyond four stated
+//! deviations, and of those that are also 5 m or more from every target; the median NEES of the
+//! position, 2.37 where covariances are right; the median error. The first seed is 1 and there are
+//! 60 sites if nothing else is asked for.
 //!
 //! `--cameras N`, `--targets N` and `--poses exact|careful|declared` set what is otherwise drawn;
-//! `--each` adds a line for each site. A change to the fusion is tried on seeds that it was not made
-//! with.
+//! `--each` adds a line for each site. A change to the fusion is tried on seeds that it was not
+//! made with.
 
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "it says what it has measured")]
 

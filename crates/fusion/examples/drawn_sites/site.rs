@@ -157,8 +157,8 @@ pub struct DrawnSite {
 }
 
 impl DrawnSite {
-    /// The site of a seed, with what is wished in place of what is drawn: with other poses it is the
-    /// same site.
+    /// The site of a seed, with what is wished in place of what is drawn: with other poses it is
+    /// the same site.
     pub fn draw(seed: u64, wishes: &Wishes) -> Result<Self, GeometryError> {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let poses = Poses::ALL[random.random_range(0..3)];
@@ -216,8 +216,8 @@ impl DrawnSite {
 }
 
 impl fmt::Display for DrawnSite {
-    /// Its cameras (distance to the middle, frames a second, deviation, share of targets seen, false
-    /// bearings an image), clocks and targets.
+    /// Its cameras (distance to the middle, frames a second, deviation, share of targets seen,
+    /// false bearings an image), clocks and targets.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for camera in &self.cameras {
             let DrawnCamera { rate_hz, sd_rad, detection, clutter, .. } = camera;

@@ -26,13 +26,13 @@ pub struct Tally {
     /// Targets that two cameras have in view, over all looks, and those of them with a track.
     targets: usize,
     found: usize,
-    /// Answers: confirmed tracks, over all looks; those beyond four stated deviations of the nearest
-    /// target, and those near none.
+    /// Answers: confirmed tracks, over all looks; those beyond four stated deviations of the
+    /// nearest target, and those near none.
     answers: usize,
     beyond: usize,
     elsewhere: usize,
-    /// Squared error of the position in each answer by its covariance (NEES). Half of them are above
-    /// 2.37 where the covariance is right.
+    /// Squared error of the position in each answer by its covariance (NEES). Half of them are
+    /// above 2.37 where the covariance is right.
     squares: Vec<f64>,
     /// Errors of those on a target, m.
     errors: Vec<f64>,
