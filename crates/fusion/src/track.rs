@@ -46,11 +46,7 @@ use ties::Ties;
 /// targets cross too. With half of it the lines of two cameras must cross at twice the angle, and
 /// targets that are far away are found later.
 const MAX_PAIR_SHARE: f64 = 0.03;
-/// Deviations of the logarithm of the range at which a target is looked for in a view. With half of
-/// them one in three is hidden from a camera in whose view it is, until that has seen it twice;
-/// with twice as much, false bearings at the border of a view are taken for a target that flies
-/// beside it.
-const RANGE_DEVIATIONS: [f64; 4] = [-2.0, -1.0, 1.0, 2.0];
+
 /// Identity of a 3D track, unique across restarts: see [`crossfix_message::track_id`]. Displayed as
 /// the track's number within its run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -326,22 +322,6 @@ impl FusedTrack {
     pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName) -> bool {
         let sees = |ties: &Ties| ties.sees(self.updated_at, self.holding_s);
         !self.ranged && !self.ties.get(camera).is_some_and(sees)
-    }
-
-    /// Where the target may be at a time beside where it is expected: where one camera alone sees
-    /// it, anywhere along that one's sight line within two standard deviations of the logarithm of
-    /// the range.
-    pub(crate) fn places_along(
-        &self,
-        time: Timestamp,
-        motion: &MotionSetup,
-    ) -> impl Iterator<Item = Point3<f64>> {
-        let along = self.alone().map(|origin| {
-            let state = self.predicted(time, motion);
-            let (away, sd) = (state.position() - origin, log_range_sd(&state, origin));
-            RANGE_DEVIATIONS.map(|deviations| origin + away * (deviations * sd).exp())
-        });
-        along.into_iter().flatten()
     }
 
     /// Whether two cameras saw the target at its newest bearing, and so its range.

@@ -146,16 +146,15 @@ impl Shared {
 
     fn complain(&self, trouble: VideoError) {
         let mut state = self.locked();
-        let is_full = state.waiting.len() - state.frames_waiting() >= TROUBLES;
-        if is_full && trouble.is_one_frame() {
-            return;
-        }
-        // That the camera is lost is said in place of one more bad frame.
-        let is_trouble = |event: &LiveEvent| matches!(event, LiveEvent::Trouble(_));
-        if is_full && let Some(newest) = state.waiting.iter().rposition(is_trouble) {
+        if state.waiting.len() - state.frames_waiting() < TROUBLES {
+            state.waiting.push_back(LiveEvent::Trouble(trouble));
+        } else if !trouble.is_one_frame()
+            && let Some(newest) = state.waiting.iter().rposition(is_bad_frame)
+        {
+            // That the camera is lost is said in place of one more bad frame.
             state.waiting.remove(newest);
+            state.waiting.push_back(LiveEvent::Trouble(trouble));
         }
-        state.waiting.push_back(LiveEvent::Trouble(trouble));
         drop(state);
         self.changed.notify_all();
     }
@@ -173,6 +172,10 @@ impl Shared {
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
     }
+}
+
+fn is_bad_frame(event: &LiveEvent) -> bool {
+    matches!(event, LiveEvent::Trouble(trouble) if trouble.is_one_frame())
 }
 
 impl Live {

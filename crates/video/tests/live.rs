@@ -337,6 +337,27 @@ fn a_reader_that_fails_is_begun_anew_and_numbers_go_on() {
     assert!(frames.windows(2).all(|f| f[1].index > f[0].index), "{frames:?}");
 }
 
+/// A source that cannot be opened a second time, and how often that was tried.
+fn opened_once(source: impl FrameSource + 'static) -> (Live, Arc<AtomicU64>) {
+    let openings = Arc::new(AtomicU64::new(0));
+    let counted = Arc::clone(&openings);
+    let mut source: Option<Box<dyn FrameSource>> = Some(Box::new(source));
+    let live = Live::start(move |_| {
+        counted.fetch_add(1, Ordering::SeqCst);
+        source.take().ok_or(VideoError::Refused { url: "rtsp://eye/".into() })
+    });
+    (live, openings)
+}
+
+/// Waits until the source has ended and is opened again.
+fn await_second_opening(openings: &AtomicU64) {
+    let begun = Instant::now();
+    while openings.load(Ordering::SeqCst) < 2 {
+        assert!(begun.elapsed() < Duration::from_secs(10), "it is not opened again");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
 /// What a camera has shown before it is lost does not look like one that is back.
 #[test]
 fn what_is_fetched_late_comes_in_its_order() {
@@ -347,23 +368,37 @@ fn what_is_fetched_late_comes_in_its_order() {
             Ok((self.0 <= 3).then(|| a_frame(self.0 - 1)))
         }
     }
-    let openings = Arc::new(AtomicU64::new(0));
-    let counted = Arc::clone(&openings);
-    let live = Live::start(move |_| match counted.fetch_add(1, Ordering::SeqCst) {
-        0 => Ok(Box::new(Ending(0))),
-        _ => Err(VideoError::Ended),
-    });
-    let begun = Instant::now();
-    while openings.load(Ordering::SeqCst) < 2 {
-        assert!(begun.elapsed() < Duration::from_secs(10), "it is opened again");
-        std::thread::sleep(Duration::from_millis(10));
-    }
+    let (live, openings) = opened_once(Ending(0));
+    await_second_opening(&openings);
     for index in 0..3 {
         let event = live.next(Duration::ZERO);
         assert!(matches!(&event, LiveEvent::Frame(frame) if frame.index == index), "{event:?}");
     }
     let event = live.next(Duration::ZERO);
     assert!(matches!(event, LiveEvent::Trouble(VideoError::Ended)), "{event:?}");
+}
+
+/// However many bad frames nobody has asked about, the loss of the camera is said.
+#[test]
+fn the_loss_of_a_camera_is_said_after_any_number_of_bad_frames() {
+    struct Broken(u64);
+    impl FrameSource for Broken {
+        fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+            let (url, what, index) = ("rtsp://eye/".into(), "no picture".into(), self.0);
+            self.0 += 1;
+            if index < 1000 { Err(VideoError::StreamFrame { url, index, what }) } else { Ok(None) }
+        }
+    }
+    let (live, openings) = opened_once(Broken(0));
+    await_second_opening(&openings);
+    let mut troubles = Vec::new();
+    while let LiveEvent::Trouble(trouble) = live.next(Duration::ZERO) {
+        troubles.push(trouble);
+    }
+    assert!(troubles.len() < 100, "{}", troubles.len());
+    assert!(troubles[0].is_one_frame(), "{troubles:?}");
+    let is_end = |trouble: &VideoError| matches!(trouble, VideoError::Ended);
+    assert_eq!(troubles.iter().filter(|trouble| is_end(trouble)).count(), 1, "{troubles:?}");
 }
 
 #[test]

@@ -11,6 +11,12 @@ use crate::prediction::{BearingFit, BearingPrediction};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, bearing_update};
 
+/// Deviations of the logarithm of the range at which a target is looked for in a view. With half of
+/// them one in three is hidden from a camera in whose view it is, until that has seen it twice;
+/// with twice as much, false bearings at the border of a view are taken for a target that flies
+/// beside it.
+const RANGE_DEVIATIONS: [f64; 4] = [-2.0, -1.0, 1.0, 2.0];
+
 /// The predicted bearing of a track for one camera.
 // Made and used in one exposure: never stored, so the size of the larger variant costs nothing.
 #[allow(clippy::large_enum_variant)]
@@ -62,6 +68,22 @@ fn fit_along(
 }
 
 impl FusedTrack {
+    /// Where the target may be at a time beside where it is expected: where one camera alone sees
+    /// it, anywhere along that one's sight line within two standard deviations of the logarithm of
+    /// the range.
+    pub(crate) fn places_along(
+        &self,
+        time: Timestamp,
+        motion: &MotionSetup,
+    ) -> impl Iterator<Item = Point3<f64>> {
+        let along = self.alone().map(|origin| {
+            let state = self.predicted(time, motion);
+            let (away, sd) = (state.position() - origin, log_range_sd(&state, origin));
+            RANGE_DEVIATIONS.map(|deviations| origin + away * (deviations * sd).exp())
+        });
+        along.into_iter().flatten()
+    }
+
     /// The predicted bearing at a time for a camera at `origin`; `None` if the target would be at
     /// the camera itself.
     pub(crate) fn expectation(

@@ -10,6 +10,32 @@ use crate::spatial::{VelocityKnowledge, map};
 use crate::uncertainty::CorrelatedNoise;
 use crate::{Manoeuvres, Tracking};
 
+/// What was outside the view of a camera that turns may be in it afterwards.
+#[test]
+fn a_camera_that_has_turned_may_see_what_was_outside_its_view() {
+    let motion = MotionSetup::new(&Tracking::default()).unwrap();
+    let [a, b, _] = orthogonal_cameras();
+    let place = Point3::new(1.0, 2.0, 3.0);
+    let lines = [a, b].map(|camera| line_at(camera, place, 0.0));
+    let solved = map(&lines, lines[0].time, 15.6).unwrap();
+    let fix = Fix {
+        time: lines[0].time,
+        state: solved.state.clone(),
+        velocity: VelocityKnowledge::Solved,
+        solver: Solver::Map,
+        observability: solved.observability(),
+    };
+    let camera: CameraName = "a".parse().unwrap();
+    let uncertainty = CameraUncertainty::of_time(0.0);
+    let start = StartLine { camera: &camera, line: &lines[0], uncertainty };
+    let mut track = FusedTrack::start(&fix, [start], &motion);
+    let [gone, next] = [1.0, 1.1].map(Timestamp::from_seconds);
+    track.note_out_of_view(&camera, gone);
+    assert!(track.visible_to(&camera, next) < 0.1);
+    track.turn_camera(&camera);
+    assert!(track.visible_to(&camera, next) > 0.9);
+}
+
 /// Mean NEES after five periods of the papers' geometry, started from the MAP fix of the first one.
 #[test]
 fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
