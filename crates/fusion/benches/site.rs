@@ -344,6 +344,13 @@ fn cases() -> Vec<Case> {
         config,
         short: false,
     });
+    // All cameras see all targets: the cost of what grows with the cameras of one target.
+    cases.push(Case {
+        name: "ring-20-targets-64-cameras".to_owned(),
+        site: ring(20, 64, 10.0),
+        config: FusionConfig::default(),
+        short: false,
+    });
     for targets in [100, 300, 1000] {
         let (site, config) = wide(targets, 1);
         cases.push(Case {

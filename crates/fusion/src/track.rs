@@ -317,6 +317,12 @@ impl FusedTrack {
         self.ties.iter().filter(|(name, ties)| lately(ties) && *name != camera).count()
     }
 
+    /// Whether a camera has given it a bearing or should have: only then is anything known of how
+    /// that camera sees the target.
+    pub(crate) fn is_tied_to(&self, camera: &CameraName) -> bool {
+        self.ties.contains_key(camera)
+    }
+
     /// Whether no two cameras saw the target at its newest bearing, and this one did not: any line
     /// of it that crosses the sight line of the other would pass for the target.
     pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName) -> bool {

@@ -147,9 +147,7 @@ impl ErrorWatch {
         let last = self.drawn.replace(now);
         let since = last.map_or(0.0, |last| now.seconds_since(last).clamp(0.0, LONGEST_DRAW_S));
         for (memory, memory_s) in self.memories.iter_mut().zip(MEMORIES_S) {
-            let kept = (-since / memory_s).exp();
-            memory.information *= kept;
-            memory.pull *= kept;
+            memory.fade((-since / memory_s).exp());
         }
         let longest_s = MEMORIES_S.into_iter().fold(0.0, f64::max);
         let kept = (-since / longest_s).exp();
@@ -183,10 +181,8 @@ impl ErrorWatch {
         for (i, one) in places.iter().enumerate() {
             let own = by_errors[i].transpose() * weights[i];
             let away = samples[i].residual - samples[i].by_position * meeting.place;
-            for memory in &mut self.memories {
-                let mut pull = memory.pull.fixed_rows_mut::<ERRORS>(ERRORS * one);
-                pull += own * away * weight;
-            }
+            let pull = own * away * weight;
+            self.memories.iter_mut().for_each(|memory| memory.add_pull(ERRORS * one, pull));
             for (j, other) in places.iter().enumerate() {
                 let across = own
                     * samples[i].by_position
@@ -195,11 +191,9 @@ impl ErrorWatch {
                     * weights[j]
                     * by_errors[j];
                 let direct = if i == j { own * by_errors[j] } else { SMatrix::zeros() };
+                let (block, told) = ([one, other].map(|place| ERRORS * place), direct - across);
                 for memory in &mut self.memories {
-                    let mut block = memory
-                        .information
-                        .fixed_view_mut::<ERRORS, ERRORS>(ERRORS * one, ERRORS * other);
-                    block += (direct - across) * weight;
+                    memory.add_information(block, told * weight);
                 }
             }
         }

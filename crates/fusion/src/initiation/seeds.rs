@@ -11,8 +11,7 @@ use nalgebra::{Point3, Vector3};
 use super::passing::{Passing, Passings};
 use super::rooted_lines::RootedLines;
 use super::{NamedLine, lines_with_pose};
-use crate::cameras::Cameras;
-use crate::cameras::Rooted;
+use crate::cameras::{Cameras, KnownCamera, Rooted};
 use crate::prediction::BearingPrediction;
 use crate::spatial::{LineId, MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::{Exposure, FusionConfig, Initiation};
@@ -87,7 +86,8 @@ pub(crate) struct SeedFinder {
 /// The lines of a period, from which sets are grown.
 struct Growing<'a> {
     exposures: &'a [&'a Exposure],
-    cameras: &'a Cameras,
+    /// The camera of each exposure.
+    cameras: &'a [Option<&'a KnownCamera>],
     rooted_lines: Option<&'a RootedLines>,
     lines: &'a [Vec<NamedLine>],
 }
@@ -164,7 +164,9 @@ impl SeedFinder {
     ) -> Vec<Seed> {
         let lines: Vec<Vec<NamedLine>> =
             exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
-        let growing = Growing { exposures, cameras, rooted_lines, lines: &lines };
+        let cameras: Vec<Option<&KnownCamera>> =
+            exposures.iter().map(|exposure| cameras.known(&exposure.camera)).collect();
+        let growing = Growing { exposures, cameras: &cameras, rooted_lines, lines: &lines };
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
         let mut seeds = Vec::new();
         let mut close = 0;
@@ -208,7 +210,7 @@ impl SeedFinder {
     /// Pairs of cameras within reach of each other that have lines, those whose optical axes cross
     /// most nearly at a right angle first (Klochko 2020, eq. 12).
     fn pairs_of_cameras(&self, growing: &Growing<'_>) -> Vec<[usize; 2]> {
-        let camera = |i: usize| Some(&growing.cameras.known(&growing.exposures[i].camera)?.camera);
+        let camera = |i: usize| Some(&growing.cameras[i]?.camera);
         let mut pairs = Vec::new();
         for a in 0..growing.exposures.len() {
             for b in a + 1..growing.exposures.len() {
@@ -238,9 +240,14 @@ impl SeedFinder {
         let mut branched = false;
         let others = |c: &usize| both.iter().all(|at| at.exposure != *c);
         for c in (0..growing.exposures.len()).filter(others) {
+            let of_set = |(set, solution): &(Vec<_>, _)| self.near(growing, set, solution, c);
+            let near: Vec<Vec<usize>> = open.iter().map(of_set).collect();
+            // So it is with most cameras of a wide site: the sets stay as they are.
+            if near.iter().all(Vec::is_empty) {
+                continue;
+            }
             let mut next = Vec::new();
-            for (set, solution) in open {
-                let near = self.near(growing, &set, &solution, c);
+            for ((set, solution), near) in open.into_iter().zip(near) {
                 let most = if branched { 1 } else { BOUNDS.branches };
                 for line in near.iter().take(most) {
                     let mut longer = set.clone();
@@ -292,7 +299,7 @@ impl SeedFinder {
         solution: &MapSolution,
         c: usize,
     ) -> Vec<usize> {
-        let known = growing.cameras.known(&growing.exposures[c].camera);
+        let known = growing.cameras[c];
         let newest = set.iter().map(|&at| growing.line(at).1.time).max();
         let (Some(known), Some(newest), Some((_, first))) =
             (known, newest, growing.lines[c].first())
@@ -307,11 +314,24 @@ impl SeedFinder {
         // Displacement (m, standard deviation) by an uncertain time and an uncertain origin.
         let moved = self.initiation.velocity_prior_sd_mps * TYPICAL_SPEED * first.time_sd_s;
         let moved = moved.hypot(first.origin_sd_m);
-        let Some(prediction) = BearingPrediction::of_state(&state, first.line.origin, moved) else {
+        // Most lines pass the place by more than any gate holds, whichever way that is long: for
+        // them alone nothing is predicted.
+        let (place, origin) = (state.position(), first.line.origin);
+        let spread = state.position_covariance().trace() + 2.0 * moved.powi(2);
+        let range_squared = (place - origin).norm_squared();
+        let may_fit = |(_, (_, timed)): &(usize, &NamedLine)| {
+            let longest = spread + timed.line.covariance.trace() * range_squared;
+            timed.line.miss_distance(place).powi(2) <= self.line_gate.threshold() * longest
+        };
+        let mut lines = growing.lines[c].iter().enumerate().filter(may_fit).peekable();
+        if lines.peek().is_none() {
+            return Vec::new();
+        }
+        let Some(prediction) = BearingPrediction::of_state(&state, origin, moved) else {
             return Vec::new();
         };
         let mut near: Vec<(f64, usize)> = Vec::new();
-        for (l, (_, timed)) in growing.lines[c].iter().enumerate() {
+        for (l, (_, timed)) in lines {
             if let Some(fit) = prediction.fit(&timed.line, self.line_gate) {
                 near.push((fit.gate_distance, l));
             }
@@ -355,9 +375,9 @@ impl SeedFinder {
         set: &[LineIndex],
         position: Point3<f64>,
     ) -> usize {
-        let exposures = growing.exposures.iter().enumerate();
-        let without = exposures.filter(|(k, _)| set.iter().all(|at| at.exposure != *k));
-        let known = without.filter_map(|(_, exposure)| growing.cameras.known(&exposure.camera));
+        let cameras = growing.cameras.iter().enumerate();
+        let without = cameras.filter(|(k, _)| set.iter().all(|at| at.exposure != *k));
+        let known = without.filter_map(|(_, known)| *known);
         known.filter(|known| known.expects(position, self.initiation.max_range_m)).count()
     }
 

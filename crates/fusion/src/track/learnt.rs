@@ -374,11 +374,12 @@ impl FusedTrack {
         parts.sort_by(|one, other| one.0.total_cmp(&other.0));
         let mut sum = Matrix6::zeros();
         for (_, name, ties) in parts {
-            let mut considered = *ties;
-            if self.learns(name) {
-                considered.fixed_columns_mut::<2>(LASTING).fill(0.0);
-            }
+            let considered = ties.fixed_columns::<CONSIDERED>(0);
             sum += considered * considered.transpose();
+            let lasting = ties.fixed_columns::<2>(LASTING);
+            if lasting.amax() > 0.0 && !self.learns(name) {
+                sum += lasting * lasting.transpose();
+            }
         }
         sum
     }

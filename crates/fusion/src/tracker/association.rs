@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use crossfix_message::TrackEventKind;
+use nalgebra::{Unit, Vector3};
 
 use super::{Noted, TrackChange, Tracker};
 use crate::assignment::{Pairing, assign};
@@ -115,14 +116,17 @@ impl Tracker {
         owners: &[Option<TrackId>],
     ) {
         let tracks = self.tracks.iter_mut().filter(|(id, track)| {
-            track.is_confirmed() && track.is_triangulated() && !owners.contains(&Some(**id))
+            track.is_confirmed()
+                && track.is_triangulated()
+                && track.is_tied_to(&exposure.camera)
+                && !owners.contains(&Some(**id))
         });
         for (_, track) in tracks {
-            let expected = track.position_at(exposure.time) - known.camera.pose().position();
-            let lines = exposure.sightings.iter().zip(owners).map(|(sighting, owner)| {
-                (sighting.line.direction.angle(&expected), sighting, owner)
+            let expected = expected_direction(track, exposure, known);
+            let lines = exposure.sightings.iter().zip(owners);
+            let beside = lines.filter_map(|(sighting, owner)| {
+                Some((chord_beside(sighting, expected)?, sighting, owner))
             });
-            let beside = lines.filter(|(away, ..)| *away < BESIDE_RAD);
             if let Some((_, nearest, owner)) = beside.min_by(|a, b| a.0.total_cmp(&b.0)) {
                 let may_be_it = owner.is_none() && nearest.rooted == Rooted::No;
                 track.gather_beside(&exposure.bearing(&nearest.line), may_be_it);
@@ -212,11 +216,27 @@ pub(super) fn fitting(
     known: &KnownCamera,
     seen: bool,
 ) -> Option<Fitting> {
-    let expected = track.position_at(exposure.time) - known.camera.pose().position();
-    let is_beside = |sighting: &Sighting| sighting.line.direction.angle(&expected) < BESIDE_RAD;
     if seen {
-        Some(Fitting::Fits)
-    } else {
-        exposure.sightings.iter().any(is_beside).then_some(Fitting::Beside)
+        return Some(Fitting::Fits);
     }
+    let expected = expected_direction(track, exposure, known);
+    let is_beside = |sighting: &Sighting| chord_beside(sighting, expected).is_some();
+    exposure.sightings.iter().any(is_beside).then_some(Fitting::Beside)
+}
+
+/// Where an exposure's camera should see a track's target.
+fn expected_direction(
+    track: &FusedTrack,
+    exposure: &Exposure,
+    known: &KnownCamera,
+) -> Unit<Vector3<f64>> {
+    let place = track.position_at(exposure.time);
+    Unit::new_normalize(place - known.camera.pose().position())
+}
+
+/// Square of the chord between a sighting and an expected direction, which at these angles is the
+/// angle, if the sighting passes beside it.
+fn chord_beside(sighting: &Sighting, expected: Unit<Vector3<f64>>) -> Option<f64> {
+    let chord = sighting.line.direction.into_inner() - expected.into_inner();
+    Some(chord.norm_squared()).filter(|squared| *squared < BESIDE_RAD.powi(2))
 }

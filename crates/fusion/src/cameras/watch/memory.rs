@@ -2,7 +2,7 @@
 
 use faer::linalg::solvers::DenseSolveCore;
 use faer::{Mat, Side};
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
 use super::ERRORS;
 
@@ -10,13 +10,29 @@ use super::ERRORS;
 /// the same.
 const UNSEEN: f64 = 1e-9;
 
+/// The sums are divided by the weight of what is new when that has grown to this: between two such
+/// divisions nothing is computed with all of them. With half of it the same; beyond 1e15 what has
+/// been summed before would be lost to rounding.
+const LARGEST_WEIGHT: f64 = 1e6;
+
 /// What the lines have said lately about all cameras' errors.
-#[derive(Clone, Debug, Default)]
+///
+/// What is old fades as what is new weighs more: 64 cameras have 200 000 sums, and a site of a
+/// thousand targets ages thousands of times a second.
+#[derive(Clone, Debug)]
 pub(super) struct Memory {
-    /// Fisher information on the errors, each in units of its own deviation.
-    pub(super) information: DMatrix<f64>,
-    /// Product of the information with the estimate of the errors.
-    pub(super) pull: DVector<f64>,
+    /// Fisher information on the errors, each in units of its own deviation, times `weight`.
+    information: DMatrix<f64>,
+    /// Product of the information with the estimate of the errors, times `weight`.
+    pull: DVector<f64>,
+    /// The weight of what is new.
+    weight: f64,
+}
+
+impl Default for Memory {
+    fn default() -> Self {
+        Self { information: DMatrix::zeros(0, 0), pull: DVector::zeros(0), weight: 1.0 }
+    }
 }
 
 /// Estimate of all errors.
@@ -27,6 +43,33 @@ pub(super) struct ErrorEstimate {
 }
 
 impl Memory {
+    /// Forgets all but this share of what it holds.
+    pub(super) fn fade(&mut self, kept: f64) {
+        self.weight /= kept;
+        if self.weight > LARGEST_WEIGHT {
+            self.information /= self.weight;
+            self.pull /= self.weight;
+            self.weight = 1.0;
+        }
+    }
+
+    /// Adds the pull of a line on the errors of a camera, which begin at `first`.
+    pub(super) fn add_pull(&mut self, first: usize, pull: SVector<f64, ERRORS>) {
+        let mut own = self.pull.fixed_rows_mut::<ERRORS>(first);
+        own += pull * self.weight;
+    }
+
+    /// Adds the information of lines on the errors of two cameras, which begin at `row` and
+    /// `column`.
+    pub(super) fn add_information(
+        &mut self,
+        [row, column]: [usize; 2],
+        information: SMatrix<f64, ERRORS, ERRORS>,
+    ) {
+        let mut block = self.information.fixed_view_mut::<ERRORS, ERRORS>(row, column);
+        block += information * self.weight;
+    }
+
     /// Enlarges to this many errors.
     pub(super) fn widen(&mut self, errors: usize) {
         self.information.resize_mut(errors, errors, 0.0);
@@ -40,7 +83,7 @@ impl Memory {
         let own_pull = self.pull.rows(first, count).into_owned();
         let mut ties = self.information.columns(first, count).into_owned();
         // Some of them may not have been seen at all.
-        let least = DMatrix::identity(count, count) * UNSEEN;
+        let least = DMatrix::identity(count, count) * (UNSEEN * self.weight);
         // I <- I - T I_ff^-1 T', and the same for the pull.
         if let Some(factor) = (own + least).cholesky() {
             self.information -= &ties * factor.solve(&ties.transpose());
@@ -68,9 +111,11 @@ impl Memory {
         let size = self.pull.len();
         let prior = |row: usize, column: usize| if row == column { 1.0 } else { 0.0 };
         // faer: of 64 cameras nalgebra's inverse takes four times as long.
-        let known = Mat::from_fn(size, size, |i, j| self.information[(i, j)] + prior(i, j));
+        let known =
+            Mat::from_fn(size, size, |i, j| self.information[(i, j)] / self.weight + prior(i, j));
         let inverse = known.llt(Side::Lower).ok()?.inverse();
         let covariance = DMatrix::from_fn(size, size, |i, j| inverse[(i, j)]);
-        Some(ErrorEstimate { mean: &covariance * &self.pull, covariance })
+        let mean = &covariance * (&self.pull / self.weight);
+        Some(ErrorEstimate { mean, covariance })
     }
 }

@@ -138,6 +138,8 @@ impl Told {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::{SMatrix, SVector};
+
     use super::super::memory::Memory;
     use super::*;
 
@@ -147,10 +149,10 @@ mod tests {
         let mut memory = Memory::default();
         memory.widen(cameras.len() * ERRORS);
         for (place, [information, found]) in cameras.iter().enumerate() {
-            for error in (ERRORS * place..ERRORS * place + CLOCK).take(CLOCK) {
-                memory.information[(error, error)] = *information;
-                memory.pull[error] = information * found;
-            }
+            let mut of_pose = SVector::<f64, ERRORS>::repeat(*information);
+            of_pose[CLOCK] = 0.0;
+            memory.add_information([ERRORS * place; 2], SMatrix::from_diagonal(&of_pose));
+            memory.add_pull(ERRORS * place, of_pose * *found);
         }
         let firsts = (0..cameras.len()).map(|place| ERRORS * place).collect();
         let mut least = least_factors(&memory.estimate().unwrap(), firsts).unwrap();
