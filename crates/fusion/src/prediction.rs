@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, MotionModels};
 use crossfix_geometry::{BearingModel, SightLine};
-use nalgebra::{Matrix2, Matrix3x2, Point3, Vector2};
+use nalgebra::{Matrix2, Point3, Vector2};
 
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
@@ -26,9 +26,6 @@ pub(crate) struct BearingPrediction {
     weights: ModelWeights,
     /// The largest of these variances, rad^2: the gate's.
     widest: f64,
-    /// Covariance that the clock's error adds where it counts as noise of each bearing, rad^2: a
-    /// part of the spread.
-    clock: Matrix2<f64>,
 }
 
 /// Mean and covariance of a bearing about the expected direction, along the tangents.
@@ -39,35 +36,6 @@ struct Spread {
     /// Covariance of the direction, rad^2: of the state without this step's process noise, and of
     /// the camera's pose and clock; the bearing's own noise comes on top.
     steady: Matrix2<f64>,
-    /// Covariance of the shift that the camera's shared errors give to all its bearings, rad^2, and
-    /// its covariance with the track's own error of direction.
-    shift: Matrix2<f64>,
-    cross: Matrix2<f64>,
-}
-
-/// One of the lines that a track was started from, compared with that track; along the tangents.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Beginning {
-    /// The line less the track's direction: the residual, rad.
-    pub(crate) left: Vector2<f64>,
-    /// Covariances of the camera's shift, of the line's noise, and of the track's position as seen
-    /// from this camera, rad^2.
-    pub(crate) shift: Matrix2<f64>,
-    pub(crate) noise: Matrix2<f64>,
-    pub(crate) placed: Matrix2<f64>,
-}
-
-/// Decomposition of a bearing's deviation from its prediction into the camera's shift (the same for
-/// all its bearings) and the rest; along the tangents.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct GivenShift {
-    /// Covariance of the shift, rad^2.
-    pub(crate) shift: Matrix2<f64>,
-    /// L: with a shift s the bearing is expected to be off by L s, as the track has already
-    /// absorbed the rest of s.
-    pub(crate) left: Matrix2<f64>,
-    /// Covariance of the deviation that remains once the shift is known, rad^2.
-    pub(crate) spread: Matrix2<f64>,
 }
 
 /// How well a bearing fits a prediction.
@@ -125,11 +93,10 @@ impl BearingPrediction {
         // H P H', with H = E' / r.
         let placed = by * state.position_covariance() * by.transpose();
         let spread = |errors: &SharedErrors| {
-            let shift = errors.spread(&shifts);
             // H X J', with X the track's covariance with the shared errors.
             let cross = by * errors.ties.fixed_rows::<3>(0) * shifts.transpose();
-            let steady = placed + cross + cross.transpose() + shift + clock;
-            Spread { shifted: shifts * errors.mean, steady, shift, cross }
+            let steady = placed + cross + cross.transpose() + errors.spread(&shifts) + clock;
+            Spread { shifted: shifts * errors.mean, steady }
         };
         // White acceleration of density q moves a position by a variance of q t^3 / 3.
         let moved = interval.abs().powi(3) / 3.0 / model.range.powi(2);
@@ -147,7 +114,6 @@ impl BearingPrediction {
             added,
             weights: imm.predicted_probabilities(interval, models),
             widest: models.widest() * moved,
-            clock,
         })
     }
 
@@ -166,55 +132,9 @@ impl BearingPrediction {
         // One model without process noise: `moved` stands for the motion.
         let mut weights = [0.0; MAX_MODELS];
         weights[0] = 1.0;
-        let none = Matrix2::zeros();
-        let known = Spread { shifted: Vector2::zeros(), steady, shift: none, cross: none };
+        let known = Spread { shifted: Vector2::zeros(), steady };
         let added = [0.0; MAX_MODELS];
-        Some(Self {
-            model,
-            factor: 1.0,
-            known,
-            renewed: None,
-            added,
-            weights,
-            widest: 0.0,
-            clock: none,
-        })
-    }
-
-    /// Range of the target, m.
-    pub(crate) fn range(&self) -> f64 {
-        self.model.range
-    }
-
-    /// The tangents at the predicted direction on which its covariances are expressed, world frame.
-    pub(crate) fn basis(&self) -> &Matrix3x2<f64> {
-        &self.model.basis
-    }
-
-    /// The expected deviation of a bearing given the shift that its camera adds to all its
-    /// bearings. The line's covariance counts at least `least_factor` times.
-    pub(crate) fn given_shift(&self, line: &SightLine, least_factor: f64) -> GivenShift {
-        // Mean process noise over the models.
-        let added: f64 =
-            self.added.iter().zip(&self.weights).map(|(added, weight)| added * weight).sum();
-        let noise = self.model.covariance_of(line) * self.factor.max(least_factor);
-        // With V the covariance of the shift s and C its covariance with the track's error e,
-        // E[e | s] = C V^-1 s: of s, L = I + C V^-1 is left, and the rest has the covariance
-        // S - L V L', with S that of the direction (`steady`).
-        let Spread { steady, shift, cross, .. } = self.known;
-        let taken = shift.try_inverse().map_or_else(Matrix2::zeros, |inverse| cross * inverse);
-        let left = Matrix2::identity() + taken;
-        let spread = steady - left * shift * left.transpose();
-        GivenShift { shift, left, spread: spread + noise + Matrix2::identity() * added }
-    }
-
-    /// The residual of a line that the track was started from, with its covariances; `None` if the
-    /// line points to the other side.
-    pub(crate) fn beginning(&self, line: &SightLine) -> Option<Beginning> {
-        let noise = self.model.covariance_of(line) * self.factor + self.clock;
-        let Spread { steady, shift, cross, .. } = self.known;
-        let placed = steady - cross - cross.transpose() - shift - self.clock;
-        Some(Beginning { left: self.model.residual(line)?, shift, noise, placed })
+        Some(Self { model, factor: 1.0, known, renewed: None, added, weights, widest: 0.0 })
     }
 
     /// How well a bearing fits; `None` if it lies outside the gate. Of the two cases, that the

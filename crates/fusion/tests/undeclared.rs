@@ -93,19 +93,25 @@ fn a_lucky_pose_is_not_taken_for_an_exact_one() {
 }
 
 /// Where the poses are exact, the lines show it: the tracks then claim what exact bearings would be
-/// good for, far less than a careful survey's 0.15 m at 150 m.
+/// good for, far less than a careful survey's 0.15 m at 150 m. In one site of ten they may miss each
+/// other by chance as those of a camera that is off.
 #[test]
 fn exact_poses_are_found_to_be_exact() {
+    const SITES: u64 = 40;
     for (cameras, most_m) in [(2, 0.09), (3, 0.06)] {
-        for seed in 0..10 {
+        let mut claims = Vec::new();
+        for seed in 0..SITES {
             let answers = answers(&site()[..cameras], 0.0, seed);
             let late = &answers[answers.len() / 2..];
             let stated = late.iter().map(|[metres, deviations]| metres / deviations).sum::<f64>();
-            let mean = stated / late.len() as f64;
-            assert!(mean < most_m, "{cameras} cameras, seed {seed}: {mean} m");
+            claims.push(stated / late.len() as f64);
             let squares: f64 = late.iter().map(|[_, deviations]| deviations.powi(2)).sum();
             assert!(squares / (late.len() as f64) < 3.0, "{cameras}, seed {seed}: {squares}");
         }
+        let unsure = claims.iter().filter(|metres| **metres >= most_m).count();
+        assert!(unsure <= SITES as usize / 10, "{cameras} cameras: {claims:?}");
+        let mean = claims.iter().sum::<f64>() / claims.len() as f64;
+        assert!(mean < most_m, "{cameras} cameras: {mean} m");
     }
 }
 

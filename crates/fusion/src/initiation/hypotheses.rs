@@ -14,7 +14,7 @@ use super::selection::{PeriodLine, ScoredLines, Selection};
 use super::{MAX_LINES, NewTrack};
 use crate::cameras::{Cameras, KnownCamera, Rooted};
 use crate::comparison::{Candidate, Comparison, ComparisonRules};
-use crate::evidence::{BEYOND_DOUBT, ONE_IN_A_HUNDRED};
+use crate::evidence::BEYOND_DOUBT;
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
 use crate::track::{FusedTrack, StartLine, TrackExpectation, TrackId, TrackStatus};
@@ -72,8 +72,6 @@ struct Hypothesis {
     born: Timestamp,
     /// The test against its lines being of several targets, one per camera.
     one_target: OneTargetTest,
-    /// See [`Seed::is_disputed`].
-    is_disputed: bool,
 }
 
 /// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
@@ -157,10 +155,9 @@ impl Hypothesis {
     /// chance, the product of the numbers of its cameras' lines. What stands in a view is counted
     /// where the hypothesis has such a line, but not for two cameras, of which one line at least
     /// has come or moved: a target that flies slowly passes for standing before one of them, and
-    /// would be found ten seconds later. What stands needs a hundred times as much, and so does
-    /// what is disputed: a third camera would have to miss a target that it should see. Else, if
-    /// none of its lines has been seen to come or to move, all may stand, and it needs as much more
-    /// as against any other rival.
+    /// would be found ten seconds later. If none of its lines has been seen to come or to move, and
+    /// how many things stand in the views is not known yet, it needs as much more as against any
+    /// other rival.
     fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, LineCounts>) -> f64 {
         let cameras = self.cameras();
         let moves = cameras.iter().any(|camera| self.rooted(camera) == Rooted::No);
@@ -170,17 +167,8 @@ impl Hypothesis {
             let number = |counts: &LineCounts| if count_all { counts.all } else { counts.others };
             log_number(lines.get(camera).map_or(1, number))
         });
-        let mut least: f64 = choices.sum();
-        let stands = self.rooted_cameras().is_some();
-        if stands {
-            least -= ONE_IN_A_HUNDRED;
-        } else if !moves {
-            least += BEYOND_DOUBT;
-        }
-        if self.is_disputed && cameras.len() == 2 {
-            least -= ONE_IN_A_HUNDRED;
-        }
-        least
+        let is_unknown = !moves && self.rooted_cameras().is_none();
+        choices.sum::<f64>() + if is_unknown { BEYOND_DOUBT } else { 0.0 }
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {
@@ -255,9 +243,12 @@ impl Hypotheses {
         now.map_or_else(Vec::new, |now| self.confirm(now, &lines, motion))
     }
 
-    /// The lines of this period that continue hypotheses of three cameras.
+    /// The lines of this period that continue hypotheses of three cameras, as far as these are
+    /// likelier to be one target than one of each camera.
     fn held(&self) -> BTreeSet<LineId> {
-        let of_three = self.hypotheses.iter().filter(|h| h.cameras().len() >= 3);
+        let is_one = |h: &&Hypothesis| h.one_target.log_ratio().is_none_or(|ratio| ratio > 0.0);
+        let likely = self.hypotheses.iter().filter(is_one);
+        let of_three = likely.filter(|h| h.cameras().len() >= 3);
         of_three.flat_map(|h| h.newest(self.period)).cloned().collect()
     }
 
@@ -325,14 +316,16 @@ impl Hypotheses {
         prediction: Option<&TrackExpectation>,
     ) -> Option<Hypothesis> {
         let Comparison { exposure, motion, .. } = *comparison;
-        // Taken before the update, as the prediction that the bearing is compared with.
-        let density = motion.density(hypothesis.track.model_probabilities());
+        if let Some(TrackExpectation::Near(_)) = prediction {
+            let density = motion.density(hypothesis.track.model_probabilities());
+            let mobility = Mobility { density, speed: self.speed };
+            let bearing = comparison.bearing(index);
+            hypothesis.one_target.see(&bearing, &hypothesis.track, mobility, ratio);
+        } else {
+            hypothesis.one_target.pass_over();
+        }
         comparison.take(&mut hypothesis.track, index)?;
         hypothesis.track.score += ratio;
-        if let Some(TrackExpectation::Near(prediction)) = prediction {
-            let mobility = Mobility { density, speed: self.speed };
-            hypothesis.one_target.see(&comparison.bearing(index), prediction, mobility, ratio);
-        }
         let id = LineId::new(exposure, index);
         hypothesis.lines.push(PeriodLine { period: self.period, id });
         let said = hypothesis.said.entry(exposure.camera.clone()).or_default();
@@ -361,17 +354,11 @@ impl Hypotheses {
             let mut track = Box::new(FusedTrack::start(&fix, named, motion));
             track.score = seed.score;
             let place = fix.state.position();
-            let mut one_target = OneTargetTest::begin(&seed.lines, place, self.speed, seed.score);
+            let one_target = OneTargetTest::begin(&seed.lines, place, self.speed, seed.score);
             let mut said = BTreeMap::new();
-            for (id @ LineId { camera, .. }, timed) in &seed.lines {
+            for (id @ LineId { camera, .. }, _) in &seed.lines {
                 let Some(own) = id.sighting_in(exposures) else { continue };
                 said.insert(camera.clone(), Said { rooted: own.rooted, evidence: seed.score });
-                let expected = uncertainty.get(camera).and_then(|uncertainty| {
-                    track.expectation(timed.time, camera, timed.line.origin, uncertainty, motion)
-                });
-                if let Some(TrackExpectation::Near(prediction)) = expected {
-                    one_target.begin_shift(camera, &own.line, &prediction);
-                }
             }
             let period = self.period;
             let lines = seed.lines.into_iter().map(|(id, _)| PeriodLine { period, id });
@@ -383,7 +370,6 @@ impl Hypotheses {
                 periods: 1,
                 born: time,
                 one_target,
-                is_disputed: seed.is_disputed,
             });
         }
     }

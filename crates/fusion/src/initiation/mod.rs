@@ -5,6 +5,7 @@
 
 mod handover;
 mod hypotheses;
+mod joint;
 mod one_target;
 mod passing;
 mod period;
@@ -12,6 +13,7 @@ mod rooted_lines;
 mod seeds;
 mod selection;
 mod sight;
+mod speeds;
 
 use std::collections::BTreeSet;
 

@@ -2,15 +2,16 @@
 //! own.
 
 use crossfix_geometry::SightLine;
-use crossfix_message::CameraName;
+use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Point3;
 
 use super::NamedLine;
+use super::joint::JointFilter;
 use super::sight::DirectionFilter;
+use super::speeds::{BySpeed, SPEEDS, SpeedCase};
 use crate::evidence::ONE_IN_A_HUNDRED;
-use crate::prediction::BearingPrediction;
 use crate::spatial::{LineId, TYPICAL_SPEED, TimedLine};
-use crate::track::TrackBearing;
+use crate::track::{FusedTrack, TrackBearing};
 use crate::visibility::independent_share;
 
 /// If the clock's uncertainty shifts a camera's bearings by a variance of more than this many times
@@ -27,17 +28,43 @@ pub(super) struct Mobility {
     pub(super) speed: f64,
 }
 
+/// A first line of something that one camera alone sees, and that may move across the line at up to
+/// `rate_sd` (rad/s, standard deviation).
+fn first_sight(line: &SightLine, time: Timestamp, rate_sd: f64) -> BySpeed<DirectionFilter> {
+    BySpeed::new(SPEEDS.map(|SpeedCase { share, log_prior }| {
+        (DirectionFilter::first(line, time, share * rate_sd), log_prior)
+    }))
+}
+
+/// A target as its track knows it, by the speed that it may have; before any line that was `speed`,
+/// m/s (standard deviation per axis).
+fn joint(track: &FusedTrack, speed: f64) -> BySpeed<JointFilter> {
+    let fastest = JointFilter::of_track(track);
+    let slowed = SPEEDS.iter().filter(|case| case.share < 1.0).filter_map(|case| {
+        let (slowed, log_ratio) = fastest.slowed(case.share, speed)?;
+        Some((slowed, case.log_prior + log_ratio))
+    });
+    let slowed: Vec<_> = slowed.collect();
+    BySpeed::new(slowed.into_iter().chain([(fastest, 0.0)]))
+}
+
 /// Log-likelihood ratio of all lines being one target's against every camera seeing a target of its
 /// own that no other camera sees, or clutter.
 ///
 /// Against clutter, any line that continues smoothly is a target's. But if there are many targets
 /// that one camera each sees, their lines cross, and only how well the lines agree with one
 /// position and velocity decides: one target has six numbers, two independent lines have four each.
+///
+/// Both are predictive likelihoods of normalised models: where each camera sees something of its
+/// own, the ratio exceeds T with a probability of 1 / T at most, however long one looks.
 #[derive(Clone, Debug)]
 pub(super) struct OneTargetTest {
     /// Each camera's lines, followed as if that camera alone saw the target.
-    sights: Vec<(CameraName, DirectionFilter)>,
-    /// Cameras that should see the target and never have, with the log-likelihood of their misses.
+    sights: Vec<(CameraName, BySpeed<DirectionFilter>)>,
+    /// All lines, followed as one target's; from the second ones on.
+    joint: Option<BySpeed<JointFilter>>,
+    /// Cameras that should see the target and have given one line at most, with the log-likelihood
+    /// of their misses.
     silent: Vec<(CameraName, f64)>,
     log_ratio: f64,
     /// Whether clocks are so uncertain that the test says nothing.
@@ -56,37 +83,37 @@ impl OneTargetTest {
         let sights = lines.iter().map(|(LineId { camera, .. }, TimedLine { line, time, .. })| {
             // A speed of v across the line turns it at v / r.
             let range = (place - line.origin).norm();
-            (camera.clone(), DirectionFilter::first(line, *time, speed / range))
+            (camera.clone(), first_sight(line, *time, speed / range))
         });
-        Self { sights: sights.collect(), silent: Vec::new(), log_ratio, inconclusive: false }
+        Self {
+            sights: sights.collect(),
+            joint: None,
+            silent: Vec::new(),
+            log_ratio,
+            inconclusive: false,
+        }
     }
 
     /// The test for what one camera alone has followed so far.
     pub(super) fn of_one(camera: &CameraName, sight: DirectionFilter) -> Self {
         Self {
-            sights: vec![(camera.clone(), sight)],
+            sights: vec![(camera.clone(), BySpeed::new([(sight, 0.0)]))],
+            joint: None,
             silent: Vec::new(),
             log_ratio: 0.0,
             inconclusive: false,
         }
     }
 
-    /// Estimates a camera's shift from the first line, one of those that the target's position was
-    /// made from.
-    pub(super) fn begin_shift(
-        &mut self,
-        camera: &CameraName,
-        line: &SightLine,
-        prediction: &BearingPrediction,
-    ) {
-        if let Some((_, sight)) = self.sights.iter_mut().find(|(name, _)| name == camera) {
-            sight.begin_shift(line, prediction);
-        }
-    }
-
     /// Whether a line of this camera has been used.
     pub(super) fn knows(&self, camera: &CameraName) -> bool {
         self.sights.iter().any(|(name, _)| name == camera)
+    }
+
+    /// Whether a camera has given more than one line: a first one may be clutter, whatever it fits.
+    fn follows(&self, camera: &CameraName) -> bool {
+        let own = self.sights.iter().find(|(name, _)| name == camera);
+        own.and_then(|(_, sight)| sight.fastest()).is_some_and(|sight| !sight.is_first())
     }
 
     /// Adds a camera's first line, with its log-likelihood ratio; the target may move across it at
@@ -98,38 +125,50 @@ impl OneTargetTest {
         first_ratio: f64,
     ) {
         self.log_ratio += first_ratio;
-        self.sights.push(((*camera).clone(), DirectionFilter::first(line, *time, rate_sd)));
+        self.sights.push(((*camera).clone(), first_sight(line, *time, rate_sd)));
     }
 
-    /// Adds a line that continues the target as predicted. `ratio` is its log-likelihood ratio
-    /// against clutter (where a target is handed over, against another thing in the view). It is
-    /// all that a camera's first line says, and no later one says more: what continues no object
-    /// that the camera alone sees may still be clutter.
+    /// Adds a line that continues the target, whose track is as before that line. `ratio` is its
+    /// log-likelihood ratio against clutter (where a target is handed over, against another thing
+    /// in the view). It is all that a camera's first line says, and no later one says more: what
+    /// continues no object that the camera alone sees may still be clutter.
     pub(super) fn see(
         &mut self,
         bearing: &TrackBearing<'_>,
-        prediction: &BearingPrediction,
+        before: &FusedTrack,
         Mobility { density, speed }: Mobility,
         ratio: f64,
     ) {
         let TrackBearing { camera, time, line, uncertainty } = *bearing;
-        let range = prediction.range();
+        let range = (before.position_at(time) - line.origin).norm();
+        let joint = self.joint.get_or_insert_with(|| joint(before, speed));
+        joint.each(|joint| joint.predict(time, density));
         let Some((_, sight)) = self.sights.iter_mut().find(|(name, _)| name == camera) else {
+            joint.see(|joint| joint.see(bearing, uncertainty.factor));
             return self.see_first(bearing, speed / range, ratio);
         };
-        sight.predict(time, density / range.powi(2));
-        self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0).min(ratio);
+        sight.each(|sight| sight.predict(time, density / range.powi(2)));
+        let factor = sight.fastest().map_or(1.0, DirectionFilter::factor);
+        let together = joint.see(|joint| joint.see(bearing, factor));
+        let alone = sight.see(|sight| sight.log_density(line, factor));
+        self.log_ratio += together.zip(alone).map_or(0.0, |(one, own)| one - own).min(ratio);
         // The shift by an uncertain clock is not known before the velocity is: use a typical speed.
         // Var = (v sd(t) / r)^2 per tangent.
         let clock = (speed * TYPICAL_SPEED * uncertainty.time_sd_s / range).powi(2);
         self.inconclusive |= clock > INCONCLUSIVE * line.covariance.trace() / 2.0;
-        sight.update(line);
+        sight.each(|sight| sight.update(line));
+    }
+
+    /// Notes that the track has taken in a line that says nothing here.
+    pub(super) fn pass_over(&mut self) {
+        // What the track knows by then is begun with anew.
+        self.joint = None;
     }
 
     /// Notes that a camera that should have seen the target has not, `interval_s` seconds after its
     /// exposure before.
     pub(super) fn miss(&mut self, camera: &CameraName, log_miss: f64, interval_s: f64) {
-        if self.sights.iter().any(|(name, _)| name == camera) {
+        if self.follows(camera) {
             return;
         }
         // Exposures close together count as one look, and all of them no more than that the camera
@@ -146,8 +185,7 @@ impl OneTargetTest {
         if self.inconclusive {
             return None;
         }
-        let never = |camera: &CameraName| self.sights.iter().all(|(name, _)| name != camera);
-        let silent = self.silent.iter().filter(|(camera, _)| never(camera));
+        let silent = self.silent.iter().filter(|(camera, _)| !self.follows(camera));
         Some(self.log_ratio + silent.map(|(_, log)| log).sum::<f64>())
     }
 }

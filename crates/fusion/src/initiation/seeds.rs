@@ -59,9 +59,6 @@ pub(crate) struct Seed {
     pub(crate) solution: MapSolution,
     /// Log-likelihood ratio of a new target against clutter.
     pub(crate) score: f64,
-    /// Whether it is of two cameras, whose lines are also part of sets of three in this period that
-    /// do not continue any of before: the third camera sees something else.
-    pub(crate) is_disputed: bool,
 }
 
 impl Seed {
@@ -364,7 +361,7 @@ impl SeedFinder {
             set.iter().map(|at| growing.exposures[at.exposure].clutter_per_sr.ln()).sum();
         let score = self.log_evidence(&lines, &solution)? - false_alarms
             + silent as f64 * (1.0 - self.detection_probability).ln();
-        (score > self.least_score).then_some(Seed { lines, solution, score, is_disputed: false })
+        (score > self.least_score).then_some(Seed { lines, solution, score })
     }
 
     /// Number of cameras that should have seen a target at this position and have no line in the
@@ -426,14 +423,13 @@ fn best(seeds: Vec<Seed>, is_held: impl Fn(&LineId) -> bool) -> Vec<Seed> {
     // cameras is turned, a great speed explains its line in each period anew, and in no two.
     let agreed: BTreeSet<&LineId> =
         order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
-    let is_disputed =
-        |i: usize| names[i].len() == 2 && names[i].iter().all(|id| agreed.contains(id));
-    order.retain(|&i| !(is_disputed(i) && names[i].iter().all(&is_held)));
+    let may_wait = |i: &usize| {
+        names[*i].len() == 2 && names[*i].iter().all(|id| agreed.contains(id) && is_held(id))
+    };
+    order.retain(|i| !may_wait(i));
     order.truncate(BOUNDS.kept);
-    let disputed: Vec<bool> = order.iter().map(|&i| is_disputed(i)).collect();
     let mut seeds: Vec<Option<Seed>> = seeds.into_iter().map(Some).collect();
-    let kept = order.into_iter().zip(disputed);
-    kept.filter_map(|(i, is_disputed)| Some(Seed { is_disputed, ..seeds[i].take()? })).collect()
+    order.into_iter().filter_map(|i| seeds[i].take()).collect()
 }
 
 fn optical_axis(pose: &Pose) -> Vector3<f64> {

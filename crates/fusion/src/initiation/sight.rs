@@ -7,7 +7,7 @@ use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix2, Unit, Vector3};
 
-use crate::prediction::{BearingPrediction, Beginning, GivenShift, log_density};
+use crate::prediction::log_density;
 
 /// Weight of the prior that the noise is as reported, as a number of coordinates (two per bearing).
 /// With half of it a few large innovations make a camera count as noisy, and true differences count
@@ -28,10 +28,6 @@ pub(super) struct DirectionFilter {
     pub(super) rate_variance: f64,
     pub(super) tie: f64,
     pub(super) time: Timestamp,
-    /// Estimate of the shift that the pose gives to all bearings of the camera (rad, world), and
-    /// its covariance along the tangents, once the first prediction has given it.
-    shift: Vector3<f64>,
-    shift_covariance: Option<Matrix2<f64>>,
     /// Sum of the squared innovations in units of the variance expected with the reported noise,
     /// and the number of coordinates in it.
     squares: f64,
@@ -48,29 +44,14 @@ impl DirectionFilter {
             rate_variance: rate_sd.powi(2),
             tie: 0.0,
             time,
-            shift: Vector3::zeros(),
-            shift_covariance: None,
             squares: PRIOR_COORDINATES,
             coordinates: PRIOR_COORDINATES,
         }
     }
 
-    /// Estimates the camera's shift from the first line, one of those that the target's position
-    /// was made from: the line's residual is divided between shift and noise in proportion to their
-    /// covariances.
-    pub(super) fn begin_shift(
-        &mut self,
-        line: &SightLine,
-        prediction: &BearingPrediction,
-    ) -> Option<()> {
-        let Beginning { left, shift, noise, placed } = prediction.beginning(line)?;
-        // K = V (V + R)^-1, with V the covariance of the shift; the residual itself has the
-        // covariance V + R - H P H', as the target was fitted to the line.
-        let total = shift + noise;
-        let gain = shift * total.try_inverse()?;
-        self.shift = prediction.basis() * (gain * left);
-        self.shift_covariance = Some(shift - gain * (total - placed) * gain.transpose());
-        Some(())
+    /// Whether it has had one line so far.
+    pub(super) fn is_first(&self) -> bool {
+        self.coordinates <= PRIOR_COORDINATES
     }
 
     /// Predicts to a time; `density` is that of the white acceleration that drives the direction,
@@ -87,33 +68,13 @@ impl DirectionFilter {
         self.time = time;
     }
 
-    /// Log-likelihood ratio of a line: the prediction of the target that all cameras see, against
-    /// the prediction of this camera alone. Also updates the camera's shift, which is the same in
-    /// all its lines.
-    pub(super) fn log_ratio(
-        &mut self,
-        line: &SightLine,
-        prediction: &BearingPrediction,
-    ) -> Option<f64> {
-        let to_tangents = prediction.basis().transpose();
-        // The line's covariance is on its own tangents; here all is on those of the prediction.
-        let turn = to_tangents * line.basis;
-        let own = turn * line.covariance * turn.transpose() * self.factor();
-        let seen = to_tangents * line.direction.into_inner();
-        let alone = seen - to_tangents * self.direction.into_inner();
-        let alone = log_density(&(own + Matrix2::identity() * self.variance), alone)?;
-        // With all cameras: z = E' d - L s, where s is the camera's shift, of which this filter
-        // knows N(shift, known): S = spread + L known L'.
-        let GivenShift { shift, left, spread } = prediction.given_shift(line, self.factor());
-        let known = self.shift_covariance.unwrap_or(shift);
-        let spread = spread + left * known * left.transpose();
-        let off = seen - left * (to_tangents * self.shift);
-        let together = log_density(&spread, off)?;
-        // The shift's Kalman update: K = known L' S^-1.
-        let gain = known * left.transpose() * spread.try_inverse()?;
-        self.shift += prediction.basis() * (gain * off);
-        self.shift_covariance = Some(known - gain * left * known);
-        Some(together - alone)
+    /// Logarithm of the probability density of a line, 1/sr, if this camera alone sees what gives
+    /// it; the line's covariance counts `factor` times. `None` if the numbers fail.
+    pub(super) fn log_density(&self, line: &SightLine, factor: f64) -> Option<f64> {
+        let own = line.covariance * factor;
+        let off =
+            line.basis.transpose() * (line.direction.into_inner() - self.direction.into_inner());
+        log_density(&(own + Matrix2::identity() * self.variance), off)
     }
 
     /// Logarithm of the probability density of a line, 1/sr, whose reported covariance counts at
@@ -145,7 +106,7 @@ impl DirectionFilter {
 
     /// Factor on the lines' reported covariances, at least 1, estimated from the innovations: if
     /// the noise is larger than reported, every small difference would otherwise pass for evidence.
-    fn factor(&self) -> f64 {
+    pub(super) fn factor(&self) -> f64 {
         (self.squares / self.coordinates).max(1.0)
     }
 }

@@ -292,6 +292,12 @@ fn predict(ties: &mut SharedTies, interval: f64, kept: f64) {
 }
 
 impl FusedTrack {
+    /// The cameras whose errors it is tied to, each with the cross-covariance, and the decay time
+    /// of the errors that last, s.
+    pub(crate) fn shared_ties(&self) -> impl Iterator<Item = (&CameraName, &SharedTies, f64)> {
+        self.ties.iter().map(|(camera, ties)| (camera, &ties.covariance, ties.lasting_s))
+    }
+
     /// Adds a bearing of the target to the next draw.
     pub(super) fn gather(&mut self, bearing: &TrackBearing<'_>, innovation: &BearingInnovation) {
         let velocity = self.state().velocity();

@@ -117,8 +117,6 @@ impl Reading {
     ) -> Option<()> {
         let comparison = context.comparison;
         let bearing @ TrackBearing { camera, time, line, .. } = comparison.bearing(index);
-        let density = comparison.motion.density(self.track.model_probabilities());
-        comparison.take(&mut self.track, index)?;
         // If two other cameras see something at the same time, their agreement tells nothing about
         // what the first camera saw before.
         let is_joint = self.track.residuals.iter().any(|(name, residual)| {
@@ -127,15 +125,17 @@ impl Reading {
         let is_first = !self.one_target.knows(camera);
         let ratio = if is_first && is_joint { 0.0 } else { ratio };
         match expected {
-            TrackExpectation::Near(prediction) => {
+            TrackExpectation::Near(_) => {
+                let density = comparison.motion.density(self.track.model_probabilities());
                 let mobility = Mobility { density, speed: rules.speed };
-                self.one_target.see(&bearing, prediction, mobility, ratio);
+                self.one_target.see(&bearing, &self.track, mobility, ratio);
             }
-            TrackExpectation::Along { .. } if is_first => {
-                let range = (self.track.state().position() - line.origin).norm();
-                self.one_target.see_first(&bearing, rules.speed / range, ratio);
-            }
-            TrackExpectation::Along { .. } => {}
+            TrackExpectation::Along { .. } => self.one_target.pass_over(),
+        }
+        comparison.take(&mut self.track, index)?;
+        if is_first && matches!(expected, TrackExpectation::Along { .. }) {
+            let range = (self.track.state().position() - line.origin).norm();
+            self.one_target.see_first(&bearing, rules.speed / range, ratio);
         }
         self.newest = LineId::new(comparison.exposure, index);
         Some(())
