@@ -93,8 +93,8 @@ fn a_lucky_pose_is_not_taken_for_an_exact_one() {
 }
 
 /// Where the poses are exact, the lines show it: the tracks then claim what exact bearings would be
-/// good for, far less than a careful survey's 0.15 m at 150 m. In one site of ten they may miss each
-/// other by chance as those of a camera that is off.
+/// good for, far less than a careful survey's 0.15 m at 150 m. In one site of ten they may miss
+/// each other by chance as those of a camera that is off.
 #[test]
 fn exact_poses_are_found_to_be_exact() {
     const SITES: u64 = 40;

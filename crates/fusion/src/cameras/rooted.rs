@@ -21,9 +21,13 @@ const MIDDLE: f64 = 2.0;
 /// seen in every second one is not.
 const LEAST_SHARE: f64 = 0.3;
 /// It may fall short of that by this many standard deviations of its number. With half of it a
-/// tree seen in every third exposure passes for something new in one of six; with twice as much
-/// what falls into one place by chance is taken for a tree for four times as long.
+/// tree that is detected with just that probability passes for something new in one of six
+/// exposures; with twice as much what falls into one place by chance is taken for a tree for four
+/// times as long.
 const SCATTER: f64 = 2.0;
+/// Least number of its reports. With half of it two false alarms in one place make a tree; with
+/// twice as many a tree before a camera of 2 Hz passes for something new for two seconds longer.
+const LEAST_REPORTS: f64 = 3.0;
 /// A place that has not been reported for this many times that time is forgotten. With half of it a
 /// light that goes out for six seconds, where that time is 1.5 s, comes back as something new.
 const FORGOTTEN: f64 = 7.0;
@@ -167,9 +171,10 @@ impl ReportedPlaces {
         if time.seconds_since(place.first) < rooted_s {
             return if may_be_old(place.first) { Rooted::Unknown } else { Rooted::No };
         }
-        // The number of reports of what is detected with probability p scatters by sqrt(n p (1 - p)).
+        // The number of reports of what is detected with a probability of p scatters by
+        // sqrt(n p (1 - p)).
         let scatter = (exposures * LEAST_SHARE * (1.0 - LEAST_SHARE)).sqrt();
-        let least = LEAST_SHARE * exposures - SCATTER * scatter;
+        let least = (LEAST_SHARE * exposures - SCATTER * scatter).max(LEAST_REPORTS);
         if place.reports >= least { Rooted::Yes } else { Rooted::No }
     }
 }

@@ -19,7 +19,8 @@ const STATE: usize = 6;
 /// Kalman filter for position and velocity of a target and for the shared errors of its cameras.
 ///
 /// A track only considers those errors, so what it expects of a line is less than its lines so far
-/// tell: one wrong pose would count anew in every line.
+/// tell: one wrong pose would count anew in every line. The clock's error counts as noise of each
+/// line here, too, as its effect is not known before the velocity is.
 #[derive(Clone, Debug)]
 pub(super) struct JointFilter {
     time: Timestamp,
@@ -40,7 +41,7 @@ impl JointFilter {
             mean: DVector::from_column_slice(mean.as_slice()),
             covariance: DMatrix::from_column_slice(STATE, STATE, covariance.as_slice()),
         };
-        for (camera, tied, lasting_s) in track.shared_ties().take(MAX_CAMERAS) {
+        for (camera, tied, lasting_s) in track.shared_ties().into_iter().take(MAX_CAMERAS) {
             let first = joint.widen(camera, lasting_s);
             let covariance = &mut joint.covariance;
             covariance.fixed_view_mut::<STATE, SHARED>(0, first).copy_from(tied);
@@ -49,9 +50,9 @@ impl JointFilter {
         joint
     }
 
-    /// The same if the target's speed has a standard deviation of only a `share` of the one that was
-    /// assumed, `speed` (m/s per axis), and the log-likelihood ratio of that. `None` if the numbers
-    /// fail.
+    /// The same if the target's speed had a standard deviation of only a `share` of the one that
+    /// was assumed before any line, `speed` (m/s per axis), and the log-likelihood ratio of that:
+    /// as far as what the track has known since came from its lines. `None` if the numbers fail.
     pub(super) fn slowed(&self, share: f64, speed: f64) -> Option<(Self, f64)> {
         // N(v; 0, s^2) / N(v; 0, S^2) has the form of a measurement of v = 0 with the variance
         // R = s^2 / (1 - s^2 / S^2).
@@ -65,6 +66,7 @@ impl JointFilter {
         // K = cov(x, v) (P_v + R)^-1, x <- x - K v, P <- P - K cov(v, x).
         slowed.mean -= &across * factor.solve(&velocity);
         slowed.covariance -= &across * factor.solve(&across.transpose());
+        slowed.balance();
         // The ratio's mean over what is known of v:
         // (S^2 / (1 - s^2 / S^2))^(3/2) |P_v + R|^(-1/2) exp(-v' (P_v + R)^-1 v / 2).
         let log_root: f64 = factor.l().diagonal().map(f64::ln).sum();
@@ -83,13 +85,15 @@ impl JointFilter {
         first
     }
 
-    /// Index of the first of a camera's errors; `None` if they count as noise.
-    fn errors_of(&mut self, camera: &CameraName, lasting_s: f64) -> Option<usize> {
-        let known = self.cameras.iter().position(|(name, _)| name == camera);
-        let widened = |joint: &mut Self| {
-            (joint.cameras.len() < MAX_CAMERAS).then(|| joint.widen(camera, lasting_s))
-        };
-        known.map(|place| STATE + SHARED * place).or_else(|| widened(self))
+    /// Index of the first of a camera's errors, which are added if they are new; `None` if they
+    /// count as noise.
+    fn find_or_add(&mut self, camera: &CameraName, lasting_s: f64) -> Option<usize> {
+        let place = self.cameras.iter().position(|(name, _)| name == camera);
+        if let Some(place) = place {
+            self.cameras[place].1 = lasting_s;
+            return Some(STATE + SHARED * place);
+        }
+        (self.cameras.len() < MAX_CAMERAS).then(|| self.widen(camera, lasting_s))
     }
 
     /// Predicts to a time: constant velocity driven by white acceleration of this density, m^2/s^3.
@@ -133,7 +137,7 @@ impl JointFilter {
     /// target, or the numbers fail.
     pub(super) fn see(&mut self, bearing: &TrackBearing<'_>, factor: f64) -> Option<f64> {
         let TrackBearing { camera, line, uncertainty, .. } = *bearing;
-        let own_errors = self.errors_of(camera, uncertainty.lasting.time_s);
+        let own_errors = self.find_or_add(camera, uncertainty.lasting.time_s);
         let place = self.mean.fixed_rows::<3>(0).into_owned();
         let velocity = self.mean.fixed_rows::<3>(3).into_owned();
         let model = BearingModel::new(line.origin, place.into())?;
@@ -157,10 +161,14 @@ impl JointFilter {
         let gain: OMatrix<f64, Dyn, U2> = &across * spread.try_inverse()?;
         self.mean += &gain * innovation;
         self.covariance -= gain * across.transpose();
-        // Rounding errors would grow.
+        self.balance();
+        Some(log_density)
+    }
+
+    /// Makes the covariance symmetric again: rounding errors would grow.
+    fn balance(&mut self) {
         let turned = self.covariance.transpose();
         self.covariance += turned;
         self.covariance *= 0.5;
-        Some(log_density)
     }
 }

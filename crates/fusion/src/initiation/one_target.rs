@@ -38,7 +38,7 @@ fn first_sight(line: &SightLine, time: Timestamp, rate_sd: f64) -> BySpeed<Direc
 
 /// A target as its track knows it, by the speed that it may have; before any line that was `speed`,
 /// m/s (standard deviation per axis).
-fn joint(track: &FusedTrack, speed: f64) -> BySpeed<JointFilter> {
+fn joint_of(track: &FusedTrack, speed: f64) -> BySpeed<JointFilter> {
     let fastest = JointFilter::of_track(track);
     let slowed = SPEEDS.iter().filter(|case| case.share < 1.0).filter_map(|case| {
         let (slowed, log_ratio) = fastest.slowed(case.share, speed)?;
@@ -55,8 +55,10 @@ fn joint(track: &FusedTrack, speed: f64) -> BySpeed<JointFilter> {
 /// that one camera each sees, their lines cross, and only how well the lines agree with one
 /// position and velocity decides: one target has six numbers, two independent lines have four each.
 ///
-/// Both are predictive likelihoods of normalised models: where each camera sees something of its
-/// own, the ratio exceeds T with a probability of 1 / T at most, however long one looks.
+/// Both are predictive likelihoods: of models that are right, the ratio would exceed T with a
+/// probability of 1 / T at most where each camera sees something of its own, however long one
+/// looks. Not all of it is counted so: a camera's first line is compared with clutter, and a line
+/// outside the gate is a miss.
 #[derive(Clone, Debug)]
 pub(super) struct OneTargetTest {
     /// Each camera's lines, followed as if that camera alone saw the target.
@@ -141,14 +143,15 @@ impl OneTargetTest {
     ) {
         let TrackBearing { camera, time, line, uncertainty } = *bearing;
         let range = (before.position_at(time) - line.origin).norm();
-        let joint = self.joint.get_or_insert_with(|| joint(before, speed));
+        let joint = self.joint.get_or_insert_with(|| joint_of(before, speed));
         joint.each(|joint| joint.predict(time, density));
         let Some((_, sight)) = self.sights.iter_mut().find(|(name, _)| name == camera) else {
             joint.see(|joint| joint.see(bearing, uncertainty.factor));
             return self.see_first(bearing, speed / range, ratio);
         };
         sight.each(|sight| sight.predict(time, density / range.powi(2)));
-        let factor = sight.fastest().map_or(1.0, DirectionFilter::factor);
+        let shown = sight.fastest().map_or(1.0, DirectionFilter::factor);
+        let factor = shown.max(uncertainty.factor);
         let together = joint.see(|joint| joint.see(bearing, factor));
         let alone = sight.see(|sight| sight.log_density(line, factor));
         self.log_ratio += together.zip(alone).map_or(0.0, |(one, own)| one - own).min(ratio);

@@ -1,4 +1,5 @@
-//! How fast what is followed may move: not at all, slowly, or as fast as anything.
+//! How fast what is followed may be when it is first seen: it stands still, is slow, or as fast as
+//! anything.
 
 /// A case: how fast what is followed may be.
 #[derive(Clone, Copy, Debug)]
@@ -48,13 +49,13 @@ impl<F> BySpeed<F> {
     /// its own; `None` if it fails in all.
     pub(super) fn see(&mut self, mut density: impl FnMut(&mut F) -> Option<f64>) -> Option<f64> {
         let before = log_sum(self.cases.iter().map(|(_, log)| *log))?;
-        let told: Vec<Option<f64>> =
+        let densities: Vec<Option<f64>> =
             self.cases.iter_mut().map(|(filter, _)| density(filter)).collect();
-        let with = |((_, log), told): (&(F, f64), &Option<f64>)| Some(log + (*told)?);
+        let weighted = |((_, log), density): (&(F, f64), &Option<f64>)| Some(log + (*density)?);
         // p = sum P_i p_i.
-        let after = log_sum(self.cases.iter().zip(&told).filter_map(with))?;
-        for ((_, log), told) in self.cases.iter_mut().zip(told) {
-            *log = told.map_or(f64::NEG_INFINITY, |told| *log + told - after);
+        let after = log_sum(self.cases.iter().zip(&densities).filter_map(weighted))?;
+        for ((_, log), density) in self.cases.iter_mut().zip(densities) {
+            *log = density.map_or(f64::NEG_INFINITY, |density| *log + density - after);
         }
         Some(after - before)
     }

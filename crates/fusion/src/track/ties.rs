@@ -292,10 +292,14 @@ fn predict(ties: &mut SharedTies, interval: f64, kept: f64) {
 }
 
 impl FusedTrack {
-    /// The cameras whose errors it is tied to, each with the cross-covariance, and the decay time
-    /// of the errors that last, s.
-    pub(crate) fn shared_ties(&self) -> impl Iterator<Item = (&CameraName, &SharedTies, f64)> {
-        self.ties.iter().map(|(camera, ties)| (camera, &ties.covariance, ties.lasting_s))
+    /// The cameras with whose errors it is correlated, the most first, each with the
+    /// cross-covariance and the decay time of the errors that last, s.
+    pub(crate) fn shared_ties(&self) -> Vec<(&CameraName, &SharedTies, f64)> {
+        let ties =
+            self.ties.iter().map(|(camera, ties)| (camera, &ties.covariance, ties.lasting_s));
+        let mut tied: Vec<_> = ties.filter(|(_, covariance, _)| covariance.amax() > 0.0).collect();
+        tied.sort_by(|one, other| other.1.norm_squared().total_cmp(&one.1.norm_squared()));
+        tied
     }
 
     /// Adds a bearing of the target to the next draw.

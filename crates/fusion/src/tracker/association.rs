@@ -125,7 +125,7 @@ impl Tracker {
             let expected = expected_direction(track, exposure, known);
             let lines = exposure.sightings.iter().zip(owners);
             let beside = lines.filter_map(|(sighting, owner)| {
-                Some((chord_beside(sighting, expected)?, sighting, owner))
+                Some((chord_squared_beside(sighting, expected)?, sighting, owner))
             });
             if let Some((_, nearest, owner)) = beside.min_by(|a, b| a.0.total_cmp(&b.0)) {
                 let may_be_it = owner.is_none() && nearest.rooted == Rooted::No;
@@ -220,7 +220,7 @@ pub(super) fn fitting(
         return Some(Fitting::Fits);
     }
     let expected = expected_direction(track, exposure, known);
-    let is_beside = |sighting: &Sighting| chord_beside(sighting, expected).is_some();
+    let is_beside = |sighting: &Sighting| chord_squared_beside(sighting, expected).is_some();
     exposure.sightings.iter().any(is_beside).then_some(Fitting::Beside)
 }
 
@@ -234,9 +234,9 @@ fn expected_direction(
     Unit::new_normalize(place - known.camera.pose().position())
 }
 
-/// Square of the chord between a sighting and an expected direction, which at these angles is the
-/// angle, if the sighting passes beside it.
-fn chord_beside(sighting: &Sighting, expected: Unit<Vector3<f64>>) -> Option<f64> {
+/// Square of the chord between a sighting and an expected direction, if the sighting passes beside
+/// it: at these angles the chord is the angle.
+fn chord_squared_beside(sighting: &Sighting, expected: Unit<Vector3<f64>>) -> Option<f64> {
     let chord = sighting.line.direction.into_inner() - expected.into_inner();
     Some(chord.norm_squared()).filter(|squared| *squared < BESIDE_RAD.powi(2))
 }

@@ -11,8 +11,8 @@ use super::ERRORS;
 const UNSEEN: f64 = 1e-9;
 
 /// The sums are divided by the weight of what is new when that has grown to this: between two such
-/// divisions nothing is computed with all of them. With half of it the same; beyond 1e15 what has
-/// been summed before would be lost to rounding.
+/// divisions nothing is computed with all of them. With half of it the same; any number that is far
+/// from overflow does.
 const LARGEST_WEIGHT: f64 = 1e6;
 
 /// What the lines have said lately about all cameras' errors.

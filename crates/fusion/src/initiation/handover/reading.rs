@@ -87,7 +87,7 @@ impl Reading {
     }
 
     /// Updates the reading with the exposure's best line; returns whether the reading is still
-    /// open: not if that line belongs to a track.
+    /// open: not if that line belongs to a track, or the numbers fail.
     pub(super) fn advance(&mut self, context: &ReadingContext<'_>, rules: &Rules) -> bool {
         let ReadingContext { comparison, is_owned } = *context;
         let Some(expected) = comparison.expectation(&self.track) else {
@@ -102,8 +102,7 @@ impl Reading {
             return false;
         }
         let ratio = best.fit.log_ratio(1.0, rules.clutter_per_sr(comparison.known));
-        self.take(context, best.index, &expected, ratio, rules);
-        true
+        self.take(context, best.index, &expected, ratio, rules).is_some()
     }
 
     /// Updates the reading with a line; `None` if the numbers fail.
