@@ -1,4 +1,20 @@
-use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
+use nalgebra::{Matrix2, Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
+
+/// Covariance of position and velocity along one axis that continuous white acceleration of power
+/// spectral density `density` (m^2/s^3 in space, rad^2/s^3 of a direction) adds in `interval`
+/// seconds; going back in time it adds as much, with the sign of the correlation turned.
+///
+/// ```
+/// use crossfix_filter::process_noise;
+/// // 2 m^2/s^3 for 3 s: 2 * 3^3 / 3, 2 * 3^2 / 2 and 2 * 3.
+/// assert_eq!(process_noise(3.0, 2.0), nalgebra::Matrix2::new(18.0, 9.0, 9.0, 6.0));
+/// ```
+pub fn process_noise(interval: f64, density: f64) -> Matrix2<f64> {
+    // Q = q [T^3/3 T^2/2; T^2/2 T].
+    let speed = density * interval.abs();
+    let across = speed * interval / 2.0;
+    Matrix2::new(speed * interval.powi(2) / 3.0, across, across, speed)
+}
 
 /// Position and velocity in space with their covariance.
 ///
@@ -62,13 +78,12 @@ impl KinematicState {
         let tied = ties + speeds * interval;
         self.covariance.fixed_view_mut::<3, 3>(0, 3).copy_from(&tied);
         self.covariance.fixed_view_mut::<3, 3>(3, 0).copy_from(&tied.transpose());
-        // Q = q [T^3/3 T^2/2; T^2/2 T] per axis; going back in time it grows as well, by |T|.
-        let noise = density * interval.abs();
+        let noise = process_noise(interval, density);
         for axis in 0..3 {
-            self.covariance[(axis, axis)] += noise * interval.powi(2) / 3.0;
-            self.covariance[(axis, axis + 3)] += noise * interval / 2.0;
-            self.covariance[(axis + 3, axis)] += noise * interval / 2.0;
-            self.covariance[(axis + 3, axis + 3)] += noise;
+            self.covariance[(axis, axis)] += noise.m11;
+            self.covariance[(axis, axis + 3)] += noise.m12;
+            self.covariance[(axis + 3, axis)] += noise.m12;
+            self.covariance[(axis + 3, axis + 3)] += noise.m22;
         }
     }
 

@@ -36,7 +36,7 @@ mod models;
 pub use axis::{AxisFilter, AxisMeasurement, Innovation};
 pub use gate::Gate;
 pub use imm::Imm;
-pub use kinematic::KinematicState;
+pub use kinematic::{KinematicState, process_noise};
 pub use manoeuvre::{NormalisedInnovation, SmoothedResidual};
 pub use mixture::normal_score;
 pub use models::{MAX_MODELS, ModeRates, ModelWeights, MotionModel, MotionModels};

@@ -18,11 +18,11 @@ use crate::uncertainty::{CameraUncertainty, SharedErrors, SharedTies, Shifts};
 
 /// Most rounds of the iterated update: with a range known to a factor of three it takes four or
 /// five. With half of it the vaguest end before they have converged.
-const MAX_ROUNDS: usize = 10;
+pub(crate) const MAX_ROUNDS: usize = 10;
 /// The iteration has converged when what the linearisation leaves out, the square of the round's
 /// step (as an angle), is less than this share of the standard deviation of the bearing's noise.
 /// With half of it some updates take a round more, for the same result.
-const SETTLED: f64 = 0.01;
+pub(crate) const SETTLED: f64 = 0.01;
 /// If the logarithm of the range has a larger standard deviation than this, the iteration starts
 /// where the sight line passes nearest to the bearing: started at the middle of the range it may
 /// not find the crossing. With half of it targets whose range is known to 7 % are shown as

@@ -14,7 +14,7 @@ use super::selection::{PeriodLine, ScoredLines, Selection};
 use super::{MAX_LINES, NewTrack};
 use crate::cameras::{Cameras, KnownCamera, Rooted};
 use crate::comparison::{Candidate, Comparison, ComparisonRules};
-use crate::evidence::BEYOND_DOUBT;
+use crate::evidence::{BEYOND_DOUBT, ONE_IN_A_HUNDRED};
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
 use crate::track::{FusedTrack, StartLine, TrackExpectation, TrackId, TrackStatus};
@@ -156,8 +156,7 @@ impl Hypothesis {
     /// where the hypothesis has such a line, but not for two cameras, of which one line at least
     /// has come or moved: a target that flies slowly passes for standing before one of them, and
     /// would be found ten seconds later. If none of its lines has been seen to come or to move, and
-    /// how many things stand in the views is not known yet, it needs as much more as against any
-    /// other rival.
+    /// how many things stand in the views is not known yet, it must be a hundred times likelier.
     fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, LineCounts>) -> f64 {
         let cameras = self.cameras();
         let moves = cameras.iter().any(|camera| self.rooted(camera) == Rooted::No);
@@ -168,7 +167,7 @@ impl Hypothesis {
             log_number(lines.get(camera).map_or(1, number))
         });
         let is_unknown = !moves && self.rooted_cameras().is_none();
-        choices.sum::<f64>() + if is_unknown { BEYOND_DOUBT } else { 0.0 }
+        choices.sum::<f64>() - if is_unknown { ONE_IN_A_HUNDRED } else { 0.0 }
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {

@@ -1,53 +1,97 @@
 //! A target as all cameras see it, with the errors that each camera's lines share.
 
-use crossfix_filter::KinematicState;
+#[cfg(test)]
+mod tests;
+
+use crossfix_filter::{KinematicState, process_noise};
 use crossfix_geometry::BearingModel;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{DMatrix, DVector, Dyn, Matrix2, Matrix3, OMatrix, U2};
+use nalgebra::{
+    DMatrix, DVector, Dyn, Matrix2, Matrix2x3, Matrix3, OMatrix, Point3, U2, Vector2, Vector3,
+};
 
 use crate::prediction::log_density;
 use crate::track::{FusedTrack, TrackBearing};
-use crate::uncertainty::{LASTING, SHARED};
+use crate::uncertainty::{CameraUncertainty, LASTING};
+use crate::update::{MAX_ROUNDS, SETTLED};
 
-/// Most cameras whose shared errors are estimated with the target; those of further cameras count
-/// as noise of each line. With half of it what a third camera shows is taken for less than it is;
-/// with twice as much a hypothesis takes three times the memory.
-const MAX_CAMERAS: usize = 4;
+/// Most pairs of errors that are estimated with the target: poses and lasting errors of four
+/// cameras, or poses alone of eight; further ones count as noise of each line. With half of it what
+/// a third camera shows is taken for less than it is; with twice as much a hypothesis takes three
+/// times the memory.
+const MAX_PAIRS: usize = 8;
 /// Position and velocity.
 const STATE: usize = 6;
+/// Errors in a pair: one along each tangent.
+const PAIR: usize = 2;
+/// Index of the first of a pair among the errors that a camera's lines share: of the pose, and of
+/// those that last.
+const PAIRS: [usize; 2] = [0, LASTING];
 
 /// Kalman filter for position and velocity of a target and for the shared errors of its cameras.
 ///
 /// A track only considers those errors, so what it expects of a line is less than its lines so far
 /// tell: one wrong pose would count anew in every line. The clock's error counts as noise of each
-/// line here, too, as its effect is not known before the velocity is.
+/// line here, as its effect is not known before the velocity is.
 #[derive(Clone, Debug)]
 pub(super) struct JointFilter {
     time: Timestamp,
-    /// The cameras whose errors follow position and velocity in `mean`, in units of their own
-    /// deviations, and the decay time of those that last, s.
-    cameras: Vec<(CameraName, f64)>,
+    /// The errors that follow position and velocity in `mean`, in units of their own deviations.
+    pairs: Vec<ErrorPair>,
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
+}
+
+/// Two errors that lines of a camera share, one along each tangent.
+#[derive(Clone, Debug)]
+struct ErrorPair {
+    camera: CameraName,
+    /// Index of the first of them among the camera's errors.
+    from: usize,
+    /// Decay time of errors that last, s; a pose's do not decay.
+    decay_s: f64,
+}
+
+/// A line's measurement equation, linearised at one place.
+struct Linearised {
+    /// Jacobian by the position.
+    by: Matrix2x3<f64>,
+    /// Jacobians by the camera's errors that are estimated, each with the index of the first.
+    shifts: [Option<(usize, Matrix2<f64>)>; 2],
+    noise: Matrix2<f64>,
+    innovation: Vector2<f64>,
+    /// Distance of the place from the camera, m.
+    range: f64,
 }
 
 impl JointFilter {
     /// What a track knows: its state, and how that is correlated with the cameras' errors.
     pub(super) fn of_track(track: &FusedTrack) -> Self {
-        let KinematicState { mean, covariance } = track.state();
-        let mut joint = Self {
-            time: track.updated_at,
-            cameras: Vec::new(),
-            mean: DVector::from_column_slice(mean.as_slice()),
-            covariance: DMatrix::from_column_slice(STATE, STATE, covariance.as_slice()),
-        };
-        for (camera, tied, lasting_s) in track.shared_ties().into_iter().take(MAX_CAMERAS) {
-            let first = joint.widen(camera, lasting_s);
-            let covariance = &mut joint.covariance;
-            covariance.fixed_view_mut::<STATE, SHARED>(0, first).copy_from(tied);
-            covariance.fixed_view_mut::<SHARED, STATE>(first, 0).copy_from(&tied.transpose());
+        let mut joint = Self::of_state(&track.state(), track.updated_at);
+        for (camera, tied, lasting_s) in track.shared_ties() {
+            for from in PAIRS {
+                let tied = tied.fixed_columns::<PAIR>(from);
+                // What is tied to nothing is met as new.
+                if tied.amax() == 0.0 {
+                    continue;
+                }
+                let Some(first) = joint.find_or_add(camera, from, lasting_s) else { break };
+                let covariance = &mut joint.covariance;
+                covariance.fixed_view_mut::<STATE, PAIR>(0, first).copy_from(&tied);
+                covariance.fixed_view_mut::<PAIR, STATE>(first, 0).copy_from(&tied.transpose());
+            }
         }
         joint
+    }
+
+    /// A state that is correlated with no camera's errors.
+    fn of_state(state: &KinematicState, time: Timestamp) -> Self {
+        Self {
+            time,
+            pairs: Vec::new(),
+            mean: DVector::from_column_slice(state.mean.as_slice()),
+            covariance: DMatrix::from_column_slice(STATE, STATE, state.covariance.as_slice()),
+        }
     }
 
     /// The same if the target's speed had a standard deviation of only a `share` of the one that
@@ -59,13 +103,13 @@ impl JointFilter {
         let faster = 1.0 - share.powi(2);
         let noise = (share * speed).powi(2) / faster;
         let mut slowed = self.clone();
-        let velocity = self.mean.fixed_rows::<3>(3).into_owned();
+        let velocity = self.velocity();
         let across = self.covariance.fixed_columns::<3>(3).into_owned();
         let spread = across.fixed_rows::<3>(3) + Matrix3::identity() * noise;
         let factor = spread.cholesky()?;
         // K = cov(x, v) (P_v + R)^-1, x <- x - K v, P <- P - K cov(v, x).
         slowed.mean -= &across * factor.solve(&velocity);
-        slowed.covariance -= &across * factor.solve(&across.transpose());
+        slowed.covariance -= &across * factor.inverse() * across.transpose();
         slowed.balance();
         // The ratio's mean over what is known of v:
         // (S^2 / (1 - s^2 / S^2))^(3/2) |P_v + R|^(-1/2) exp(-v' (P_v + R)^-1 v / 2).
@@ -74,26 +118,32 @@ impl JointFilter {
         Some((slowed, 1.5 * (speed.powi(2) / faster).ln() - log_root - squares / 2.0))
     }
 
-    /// Adds the errors of a camera, of which nothing is known but their deviations; returns the
-    /// index of the first.
-    fn widen(&mut self, camera: &CameraName, lasting_s: f64) -> usize {
-        let first = self.mean.len();
-        self.cameras.push((camera.clone(), lasting_s));
-        self.mean.resize_vertically_mut(first + SHARED, 0.0);
-        self.covariance.resize_mut(first + SHARED, first + SHARED, 0.0);
-        self.covariance.fixed_view_mut::<SHARED, SHARED>(first, first).fill_with_identity();
-        first
+    fn place(&self) -> Point3<f64> {
+        self.mean.fixed_rows::<3>(0).into_owned().into()
     }
 
-    /// Index of the first of a camera's errors, which are added if they are new; `None` if they
-    /// count as noise.
-    fn find_or_add(&mut self, camera: &CameraName, lasting_s: f64) -> Option<usize> {
-        let place = self.cameras.iter().position(|(name, _)| name == camera);
-        if let Some(place) = place {
-            self.cameras[place].1 = lasting_s;
-            return Some(STATE + SHARED * place);
+    fn velocity(&self) -> Vector3<f64> {
+        self.mean.fixed_rows::<3>(3).into_owned()
+    }
+
+    /// Index of the first of a pair of a camera's errors, of which nothing is known but their
+    /// deviations if they are new; `None` if they count as noise.
+    fn find_or_add(&mut self, camera: &CameraName, from: usize, lasting_s: f64) -> Option<usize> {
+        let decay_s = if from == LASTING { lasting_s } else { f64::INFINITY };
+        let known = self.pairs.iter().position(|pair| pair.from == from && pair.camera == *camera);
+        if let Some(place) = known {
+            self.pairs[place].decay_s = decay_s;
+            return Some(STATE + PAIR * place);
         }
-        (self.cameras.len() < MAX_CAMERAS).then(|| self.widen(camera, lasting_s))
+        if self.pairs.len() == MAX_PAIRS {
+            return None;
+        }
+        self.pairs.push(ErrorPair { camera: camera.clone(), from, decay_s });
+        let first = self.mean.len();
+        self.mean.resize_vertically_mut(first + PAIR, 0.0);
+        self.covariance.resize_mut(first + PAIR, first + PAIR, 0.0);
+        self.covariance.fixed_view_mut::<PAIR, PAIR>(first, first).fill_with_identity();
+        Some(first)
     }
 
     /// Predicts to a time: constant velocity driven by white acceleration of this density, m^2/s^3.
@@ -113,62 +163,120 @@ impl JointFilter {
             let mut place = self.covariance.column_mut(axis);
             place += speed;
         }
-        for (place, (_, lasting_s)) in self.cameras.iter().enumerate() {
-            let kept = (-dt.abs() / lasting_s).exp();
-            for error in (LASTING..SHARED).map(|error| STATE + SHARED * place + error) {
+        for (place, pair) in self.pairs.iter().enumerate().filter(|(_, p)| p.decay_s.is_finite()) {
+            let kept = (-dt.abs() / pair.decay_s).exp();
+            for error in (0..PAIR).map(|tangent| STATE + PAIR * place + tangent) {
                 self.mean[error] *= kept;
                 self.covariance.row_mut(error).scale_mut(kept);
                 self.covariance.column_mut(error).scale_mut(kept);
                 self.covariance[(error, error)] += 1.0 - kept.powi(2);
             }
         }
-        // Q = q [T^3/3 T^2/2; T^2/2 T] per axis; going back in time it grows as well.
-        let noise = density * dt.abs();
+        let noise = process_noise(dt, density);
         for axis in 0..3 {
-            self.covariance[(axis, axis)] += noise * dt.powi(2) / 3.0;
-            self.covariance[(axis, axis + 3)] += noise * dt / 2.0;
-            self.covariance[(axis + 3, axis)] += noise * dt / 2.0;
-            self.covariance[(axis + 3, axis + 3)] += noise;
+            self.covariance[(axis, axis)] += noise.m11;
+            self.covariance[(axis, axis + 3)] += noise.m12;
+            self.covariance[(axis + 3, axis)] += noise.m12;
+            self.covariance[(axis + 3, axis + 3)] += noise.m22;
         }
     }
 
     /// Takes in a line of the same time, whose reported covariance counts at least `factor` times;
     /// returns the logarithm of its probability density, 1/sr. `None` if it points away from the
     /// target, or the numbers fail.
+    ///
+    /// Iterated, as a track's update is: a target whose speed is not known yet may be anywhere
+    /// within the distance that it flies from one exposure to the next.
     pub(super) fn see(&mut self, bearing: &TrackBearing<'_>, factor: f64) -> Option<f64> {
-        let TrackBearing { camera, line, uncertainty, .. } = *bearing;
-        let own_errors = self.find_or_add(camera, uncertainty.lasting.time_s);
-        let place = self.mean.fixed_rows::<3>(0).into_owned();
-        let velocity = self.mean.fixed_rows::<3>(3).into_owned();
-        let model = BearingModel::new(line.origin, place.into())?;
-        let shifts = uncertainty.shifts(&model, velocity);
-        let own = model.covariance_of(line) * (factor / uncertainty.factor).max(1.0);
-        let mut noise = uncertainty.noise(&model, velocity, &own);
-        let mut innovation = model.residual(line)?;
-        // G = [H 0 ... J ... 0], by position and the camera's own errors.
-        let mut by = OMatrix::<f64, U2, Dyn>::zeros(self.mean.len());
-        by.fixed_columns_mut::<3>(0).copy_from(&model.by_position());
-        if let Some(first) = own_errors {
-            by.fixed_columns_mut::<SHARED>(first).copy_from(&shifts);
-            innovation -= shifts * self.mean.fixed_rows::<SHARED>(first);
-        } else {
-            noise += shifts * shifts.transpose();
+        let TrackBearing { camera, uncertainty: CameraUncertainty { pose, lasting, .. }, .. } =
+            *bearing;
+        let is_there = [pose.is_some(), lasting.sd_rad > 0.0];
+        let mut firsts = [None; 2];
+        for (first, (from, is_there)) in firsts.iter_mut().zip(PAIRS.into_iter().zip(is_there)) {
+            if is_there {
+                *first = self.find_or_add(camera, from, lasting.time_s);
+            }
         }
-        // Cov(x, z) = P G', S = G P G' + R, K = Cov(x, z) S^-1.
-        let across = &self.covariance * by.transpose();
-        let spread: Matrix2<f64> = &by * &across + noise;
-        let log_density = log_density(&spread, innovation)?;
-        let gain: OMatrix<f64, Dyn, U2> = &across * spread.try_inverse()?;
-        self.mean += &gain * innovation;
-        self.covariance -= gain * across.transpose();
-        self.balance();
-        Some(log_density)
+        let before = self.place();
+        let mut place = before;
+        for round in 1.. {
+            let seen = self.linearised(place, bearing, factor, firsts)?;
+            // Cov(x, z) = P G', S = G P G' + R, K = Cov(x, z) S^-1.
+            let across = self.across(&seen);
+            let spread = seen.times(&across) + seen.noise;
+            let inverse = spread.try_inverse()?;
+            let pull = inverse * seen.innovation;
+            let next = before + across.fixed_rows::<3>(0) * pull;
+            let moved = (next - place).norm() / seen.range;
+            place = next;
+            let settled = moved.powi(2) < SETTLED * (seen.noise.trace() / 2.0).sqrt();
+            if !(settled || round == MAX_ROUNDS) {
+                continue;
+            }
+            self.mean += &across * pull;
+            self.covariance -= &across * inverse * across.transpose();
+            self.balance();
+            return log_density(&spread, seen.innovation);
+        }
+        None
+    }
+
+    /// A line's measurement equation at a place; `firsts` are the indices of the camera's errors.
+    fn linearised(
+        &self,
+        place: Point3<f64>,
+        &TrackBearing { line, uncertainty, .. }: &TrackBearing<'_>,
+        factor: f64,
+        firsts: [Option<usize>; 2],
+    ) -> Option<Linearised> {
+        let model = BearingModel::new(line.origin, place)?;
+        let own = model.covariance_of(line) * (factor / uncertainty.factor).max(1.0);
+        let camera = CameraUncertainty { clock_is_noise: true, ..*uncertainty };
+        let all = camera.shifts(&model, self.velocity());
+        let mut noise = camera.noise(&model, self.velocity(), &own);
+        let by = model.by_position();
+        let mut innovation = model.residual(line)? + by * (place - self.place());
+        let mut shifts = [None; 2];
+        for (index, from) in PAIRS.into_iter().enumerate() {
+            let shift: Matrix2<f64> = all.fixed_columns::<PAIR>(from).into_owned();
+            if let Some(first) = firsts[index] {
+                innovation -= shift * self.mean.fixed_rows::<PAIR>(first);
+                shifts[index] = Some((first, shift));
+            } else {
+                noise += shift * shift.transpose();
+            }
+        }
+        Some(Linearised { by, shifts, noise, innovation, range: model.range })
+    }
+
+    /// P G', with G the line's Jacobian by all that is estimated.
+    fn across(&self, Linearised { by, shifts, .. }: &Linearised) -> OMatrix<f64, Dyn, U2> {
+        let mut across = self.covariance.fixed_columns::<3>(0) * by.transpose();
+        for (first, shift) in shifts.iter().flatten() {
+            across += self.covariance.fixed_columns::<PAIR>(*first) * shift.transpose();
+        }
+        across
     }
 
     /// Makes the covariance symmetric again: rounding errors would grow.
     fn balance(&mut self) {
-        let turned = self.covariance.transpose();
-        self.covariance += turned;
-        self.covariance *= 0.5;
+        for row in 1..self.covariance.nrows() {
+            for column in 0..row {
+                let mean = (self.covariance[(row, column)] + self.covariance[(column, row)]) / 2.0;
+                self.covariance[(row, column)] = mean;
+                self.covariance[(column, row)] = mean;
+            }
+        }
+    }
+}
+
+impl Linearised {
+    /// G times a matrix with a row for each of what is estimated.
+    fn times(&self, across: &OMatrix<f64, Dyn, U2>) -> Matrix2<f64> {
+        let mut product = self.by * across.fixed_rows::<3>(0);
+        for (first, shift) in self.shifts.iter().flatten() {
+            product += shift * across.fixed_rows::<PAIR>(*first);
+        }
+        product
     }
 }

@@ -2,7 +2,7 @@
 
 use std::f64::consts::PI;
 
-use crossfix_filter::Gate;
+use crossfix_filter::{Gate, process_noise};
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix2, Unit, Vector3};
@@ -60,11 +60,10 @@ impl DirectionFilter {
         let dt = time.seconds_since(self.time);
         self.direction = Unit::new_normalize(self.direction.into_inner() + self.rate * dt);
         // A clock's correction may lead back in time: this must not make the direction surer.
-        // Process noise: q [t^3/3, t^2/2; t^2/2, t].
-        let noise = density * dt.abs();
-        self.variance += dt * (2.0 * self.tie + dt * self.rate_variance) + noise * dt * dt / 3.0;
-        self.tie += dt * self.rate_variance + noise * dt / 2.0;
-        self.rate_variance += noise;
+        let noise = process_noise(dt, density);
+        self.variance += dt * (2.0 * self.tie + dt * self.rate_variance) + noise.m11;
+        self.tie += dt * self.rate_variance + noise.m12;
+        self.rate_variance += noise.m22;
         self.time = time;
     }
 
