@@ -67,3 +67,39 @@ fn log_sum(logs: impl Iterator<Item = f64> + Clone) -> Option<f64> {
     let most = logs.clone().fold(f64::NEG_INFINITY, f64::max);
     most.is_finite().then(|| most + logs.map(|log| (log - most).exp()).sum::<f64>().ln())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_density_is_the_mean_over_the_cases_and_each_gains_by_its_own() {
+        // One case is three times as likely as the other beforehand, and half as likely as that to
+        // give what is seen.
+        let mut speeds = BySpeed::new([(0.2_f64, 3.0_f64.ln()), (0.4, 0.0)]);
+        let density = speeds.see(|density| Some(density.ln())).unwrap();
+        assert!((density - (0.75 * 0.2 + 0.25 * 0.4_f64).ln()).abs() < 1e-12);
+        // Now they are as 0.15 to 0.10.
+        let density = speeds.see(|density| Some(density.ln())).unwrap();
+        assert!((density - (0.6 * 0.2 + 0.4 * 0.4_f64).ln()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_case_that_fails_is_out_and_what_fails_in_all_says_nothing() {
+        let mut speeds = BySpeed::new([(0.2_f64, 0.0), (0.4, 0.0)]);
+        let density = speeds.see(|density| (*density > 0.3).then(|| density.ln())).unwrap();
+        assert!((density - 0.2_f64.ln()).abs() < 1e-12);
+        let density = speeds.see(|density| Some(density.ln())).unwrap();
+        assert!((density - 0.4_f64.ln()).abs() < 1e-12);
+        assert_eq!(speeds.see(|_| None), None);
+        assert!((speeds.see(|density| Some(density.ln())).unwrap() - 0.4_f64.ln()).abs() < 1e-12);
+    }
+
+    /// However unlikely what has been seen is in all cases, they are still told apart.
+    #[test]
+    fn densities_that_underflow_are_compared() {
+        let mut speeds = BySpeed::new([(-2000.0, 0.0), (-2010.0, 0.0)]);
+        let density = speeds.see(|log| Some(*log)).unwrap();
+        assert!((density - (-2000.0 + 0.5_f64.ln())).abs() < 1e-3, "{density}");
+    }
+}
