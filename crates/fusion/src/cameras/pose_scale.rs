@@ -61,10 +61,12 @@ pub(crate) struct ScaleSample {
     pub(crate) pose: Matrix2<f64>,
     /// Derivative of the residual by the camera's rotation (rad/rad) and place (rad/m).
     pub(crate) by_pose: Matrix2x6<f64>,
-    /// Shift of the residual by one deviation of the camera's clock, rad.
-    pub(crate) clock: Vector2<f64>,
+    /// Derivative of the residual by the camera's clock, rad/s.
+    pub(crate) by_time: Vector2<f64>,
+    /// Standard deviation of that clock, s.
+    pub(crate) clock_sd_s: f64,
     /// Covariance of white noise per draw that averages out as slowly, rad^2: part of the noise
-    /// lasts from one draw to the next, and `clock` is only as sure as the velocity.
+    /// lasts from one draw to the next, and `by_time` is only as sure as the velocity.
     pub(crate) slow_noise: Matrix2<f64>,
     /// Whether part of the noise was known to last.
     pub(crate) noise_lasts: bool,

@@ -176,6 +176,8 @@ impl ErrorWatch {
         let count = 2.0 * samples.len() as f64 - 3.0;
         let weight = (FREEDOM + count) / (FREEDOM + squares.max(count));
         let meeting = Meeting::of(samples, &weights)?;
+        let memories = self.memories.iter_mut();
+        memories.for_each(|memory| memory.add_squares(meeting.squares * weight, count * weight));
         // With the target's place x eliminated (covariance S): pull_i = B_i' W_i (z_i - A_i x) and
         // I_ij = [i = j] B_i' W_i B_i - B_i' W_i A_i S A_j' W_j B_j.
         for (i, one) in places.iter().enumerate() {
@@ -229,8 +231,12 @@ impl ErrorWatch {
     ) -> BTreeMap<CameraName, f64> {
         let cameras = self.cameras.iter().enumerate();
         let undeclared = cameras.filter(|(_, camera)| !is_declared(&camera.name));
-        let firsts = undeclared.map(|(place, _)| ERRORS * place).collect();
-        let found = estimates.first().and_then(|latest| survey::least_factors(latest, firsts));
+        let judged = undeclared.map(|(place, camera)| survey::Judged {
+            first: ERRORS * place,
+            clock_sd_s: camera.clock_sd_s,
+        });
+        let judged = judged.collect();
+        let found = estimates.first().and_then(|latest| survey::least_factors(latest, judged));
         let name = |first: usize| self.cameras[first / ERRORS].name.clone();
         found.into_iter().flatten().map(|(first, least)| (name(first), least)).collect()
     }
@@ -338,7 +344,8 @@ mod tests {
                 noise: Matrix2::identity() * 1e-8,
                 pose: Matrix2::identity() * 3e-4,
                 by_pose: model.by_pose(),
-                clock: Vector2::zeros(),
+                by_time: Vector2::zeros(),
+                clock_sd_s: 0.0,
                 slow_noise: Matrix2::identity() * 1e-8,
                 noise_lasts: false,
             }

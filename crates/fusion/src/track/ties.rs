@@ -115,7 +115,7 @@ pub(super) struct Drawn {
     lasting: CorrelatedNoise,
     pose: Matrix2<f64>,
     by_pose: Matrix2x6<f64>,
-    clock: Vector2<f64>,
+    by_time: Vector2<f64>,
     /// Standard deviation of the clock, s.
     time_sd_s: f64,
 }
@@ -138,7 +138,7 @@ impl Drawn {
             lasting: uncertainty.lasting,
             pose: uncertainty.declared_pose(&innovation.model),
             by_pose: innovation.model.by_pose(),
-            clock: innovation.model.by_time(velocity) * uncertainty.time_sd_s,
+            by_time: innovation.model.by_time(velocity),
             time_sd_s: uncertainty.time_sd_s,
         }
     }
@@ -163,7 +163,8 @@ impl Drawn {
             noise: white + Matrix2::identity() * self.lasting.variance(),
             pose: self.pose,
             by_pose: self.by_pose,
-            clock: self.clock,
+            by_time: self.by_time,
+            clock_sd_s: self.time_sd_s,
             slow_noise: white + lasting + by_speed * by_speed.transpose(),
             noise_lasts: self.lasting.sd_rad > 0.0,
         }

@@ -21,6 +21,9 @@ const EXACT_RAD: f64 = 1e-6;
 /// for the errors that a lens leaves; with half of it those of targets near the camera may count as
 /// a move.
 const LEAST_SHIFT_M: f64 = 2e-3;
+/// Least deviation of its clock, s: where an exact one is declared, nothing else would tell whether
+/// it is off. With half of it the same.
+const LEAST_CLOCK_S: f64 = 1e-4;
 
 /// A camera whose errors are watched.
 #[derive(Clone, Debug)]
@@ -32,6 +35,8 @@ pub(super) struct Watched {
     /// Mean square of the shift of its newest line by the declared error of its pose, rad^2 per
     /// tangent.
     declared_rad2: f64,
+    /// Standard deviation of its clock at its newest line, s: the unit of the clock's error.
+    pub(super) clock_sd_s: f64,
     /// The direction in which it looks.
     forward: Unit<Vector3<f64>>,
     pub(super) watched_s: f64,
@@ -59,6 +64,7 @@ impl Watched {
             covariance,
             root,
             declared_rad2: 0.0,
+            clock_sd_s: LEAST_CLOCK_S,
             forward,
             watched_s: 0.0,
             noise_lasts: false,
@@ -79,7 +85,7 @@ impl Watched {
         // In units of the declared deviations: a pose error L s, with C = L L' and s of unit
         // variance.
         by.fixed_columns_mut::<6>(0).copy_from(&(sample.by_pose * self.root));
-        by.set_column(CLOCK, &sample.clock);
+        by.set_column(CLOCK, &(sample.by_time * sample.clock_sd_s.max(LEAST_CLOCK_S)));
         by
     }
 
@@ -99,7 +105,7 @@ impl Watched {
     /// has been; its own errors begin at `first`.
     pub(super) fn knocks(&self, estimates: &[ErrorEstimate], first: usize) -> Option<Knocks> {
         let mut each = Vec::with_capacity(KNOCKS_RAD.len() * estimates.len());
-        for ErrorEstimate { mean, covariance } in estimates {
+        for ErrorEstimate { mean, covariance, .. } in estimates {
             let mean = mean.fixed_rows::<ERRORS>(first).into_owned();
             let own = covariance.fixed_view::<ERRORS, ERRORS>(first, first).into_owned();
             for knock_rad in KNOCKS_RAD {
@@ -125,6 +131,7 @@ impl Watched {
     /// Notes a line that is compared with others'.
     pub(super) fn see(&mut self, sample: &ScaleSample) {
         self.declared_rad2 = sample.pose.norm_squared() / 2.0;
+        self.clock_sd_s = sample.clock_sd_s.max(LEAST_CLOCK_S);
     }
 
     /// The finding if it has been moved.

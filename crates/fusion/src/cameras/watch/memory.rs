@@ -25,13 +25,23 @@ pub(super) struct Memory {
     information: DMatrix<f64>,
     /// Product of the information with the estimate of the errors, times `weight`.
     pull: DVector<f64>,
+    /// Sum of the squared misses of the lines, in units of their noise, and the number of
+    /// coordinates in it, times `weight`.
+    squares: f64,
+    coordinates: f64,
     /// The weight of what is new.
     weight: f64,
 }
 
 impl Default for Memory {
     fn default() -> Self {
-        Self { information: DMatrix::zeros(0, 0), pull: DVector::zeros(0), weight: 1.0 }
+        Self {
+            information: DMatrix::zeros(0, 0),
+            pull: DVector::zeros(0),
+            squares: 0.0,
+            coordinates: 0.0,
+            weight: 1.0,
+        }
     }
 }
 
@@ -40,6 +50,11 @@ impl Default for Memory {
 pub(super) struct ErrorEstimate {
     pub(super) mean: DVector<f64>,
     pub(super) covariance: DMatrix<f64>,
+    /// Sum of the squared misses of the lines that the errors do not explain, in units of their
+    /// noise, ...
+    pub(super) unexplained: f64,
+    /// ... and the number of coordinates in it.
+    pub(super) coordinates: f64,
 }
 
 impl Memory {
@@ -49,8 +64,17 @@ impl Memory {
         if self.weight > LARGEST_WEIGHT {
             self.information /= self.weight;
             self.pull /= self.weight;
+            self.squares /= self.weight;
+            self.coordinates /= self.weight;
             self.weight = 1.0;
         }
+    }
+
+    /// Adds the squared misses of lines of a target, in units of their noise, and the number of
+    /// coordinates in them.
+    pub(super) fn add_squares(&mut self, squares: f64, coordinates: f64) {
+        self.squares += squares * self.weight;
+        self.coordinates += coordinates * self.weight;
     }
 
     /// Adds the pull of a line on the errors of a camera, which begin at `first`.
@@ -77,7 +101,8 @@ impl Memory {
     }
 
     /// Forgets `count` errors from `first` on, which are other errors from now on. The information
-    /// on all others becomes what it is if these may have been anything (the Schur complement).
+    /// on all others becomes what it is if these may have been anything (the Schur complement);
+    /// what those explain is no miss.
     pub(super) fn forget(&mut self, first: usize, count: usize) {
         let own = self.information.view((first, first), (count, count)).into_owned();
         let own_pull = self.pull.rows(first, count).into_owned();
@@ -88,9 +113,11 @@ impl Memory {
         if let Some(factor) = (own + least).cholesky() {
             self.information -= &ties * factor.solve(&ties.transpose());
             self.pull -= &ties * factor.solve(&own_pull);
+            self.squares -= own_pull.dot(&factor.solve(&own_pull));
         } else {
             self.information.fill(0.0);
             self.pull.fill(0.0);
+            (self.squares, self.coordinates) = (0.0, 0.0);
         }
         ties.fill(0.0);
         self.information.columns_mut(first, count).copy_from(&ties);
@@ -116,6 +143,9 @@ impl Memory {
         let inverse = known.llt(Side::Lower).ok()?.inverse();
         let covariance = DMatrix::from_fn(size, size, |i, j| inverse[(i, j)]);
         let mean = &covariance * (&self.pull / self.weight);
-        Some(ErrorEstimate { mean, covariance })
+        // The least of z' W z - 2 h' s + s' A s is at s = A^-1 h.
+        let unexplained = (self.squares - self.pull.dot(&mean)) / self.weight;
+        let coordinates = self.coordinates / self.weight;
+        Some(ErrorEstimate { mean, covariance, unexplained, coordinates })
     }
 }
