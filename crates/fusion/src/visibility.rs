@@ -2,16 +2,6 @@
 
 use crossfix_message::Timestamp;
 
-/// Typical time for which an obstacle hides a target from cameras, s. With half of it a camera
-/// behind a tree speaks against a target twice as fast; with twice as much, ghosts live longer.
-const HIDDEN_S: f64 = 0.25;
-
-/// Weight of a piece of evidence that follows another of the same target after `interval_s`
-/// seconds: exposures close together tell no more than one.
-pub(crate) fn independent_share(interval_s: f64) -> f64 {
-    (interval_s / HIDDEN_S).clamp(0.0, 1.0)
-}
-
 /// Rate at which a visible target is hidden from a camera (by a tree, a house, glare), per time for
 /// which a camera's bearing holds (supports) a track: once in twenty seconds. With half of it a
 /// camera that is blind for a target costs its track too much.

@@ -64,6 +64,29 @@ struct Linearised {
     range: f64,
 }
 
+/// What a line corrects.
+#[derive(Clone, Debug)]
+struct Correction {
+    /// Cov(x, z) = P G', ...
+    across: OMatrix<f64, Dyn, U2>,
+    /// ... S = G P G' + R, ...
+    spread: Matrix2<f64>,
+    /// ... and S^-1.
+    inverse: Matrix2<f64>,
+    innovation: Vector2<f64>,
+    /// Standard deviation of the line's noise, rad.
+    noise_rad: f64,
+    /// Distance of the place from the camera, m.
+    range: f64,
+}
+
+impl Correction {
+    /// S^-1 z: the mean of x grows by Cov(x, z) S^-1 z.
+    fn pull(&self) -> Vector2<f64> {
+        self.inverse * self.innovation
+    }
+}
+
 impl JointFilter {
     /// What a track knows: its state, and how that is correlated with the cameras' errors.
     pub(super) fn of_track(track: &FusedTrack) -> Self {
@@ -186,7 +209,8 @@ impl JointFilter {
     /// target, or the numbers fail.
     ///
     /// Iterated, as a track's update is: a target whose speed is not known yet may be anywhere
-    /// within the distance that it flies from one exposure to the next.
+    /// within the distance that it flies from one exposure to the next. Where the rounds do not
+    /// approach a place, the range is so vague that the first is as good as any other.
     pub(super) fn see(&mut self, bearing: &TrackBearing<'_>, factor: f64) -> Option<f64> {
         let TrackBearing { camera, uncertainty: CameraUncertainty { pose, lasting, .. }, .. } =
             *bearing;
@@ -198,27 +222,50 @@ impl JointFilter {
             }
         }
         let before = self.place();
-        let mut place = before;
-        for round in 1.. {
-            let seen = self.linearised(place, bearing, factor, firsts)?;
-            // Cov(x, z) = P G', S = G P G' + R, K = Cov(x, z) S^-1.
-            let across = self.across(&seen);
-            let spread = seen.times(&across) + seen.noise;
-            let inverse = spread.try_inverse()?;
-            let pull = inverse * seen.innovation;
-            let next = before + across.fixed_rows::<3>(0) * pull;
-            let moved = (next - place).norm() / seen.range;
-            place = next;
-            let settled = moved.powi(2) < SETTLED * (seen.noise.trace() / 2.0).sqrt();
-            if !(settled || round == MAX_ROUNDS) {
-                continue;
+        let at_first = self.correction(before, bearing, factor, firsts)?;
+        let mut correction = at_first.clone();
+        let (mut place, mut moved_before) = (before, f64::INFINITY);
+        for _ in 0..MAX_ROUNDS {
+            let next = before + correction.across.fixed_rows::<3>(0) * correction.pull();
+            let moved = (next - place).norm() / correction.range;
+            if moved.powi(2) < SETTLED * correction.noise_rad {
+                return self.corrected(&correction);
             }
-            self.mean += &across * pull;
-            self.covariance -= &across * inverse * across.transpose();
-            self.balance();
-            return log_density(&spread, seen.innovation);
+            let next_one = self.correction(next, bearing, factor, firsts);
+            let Some(next_one) = next_one.filter(|_| moved < moved_before) else { break };
+            (place, moved_before, correction) = (next, moved, next_one);
         }
-        None
+        self.corrected(&at_first)
+    }
+
+    /// Applies a correction; returns the logarithm of the line's probability density.
+    fn corrected(&mut self, correction: &Correction) -> Option<f64> {
+        let Correction { across, inverse, spread, innovation, .. } = correction;
+        self.mean += across * correction.pull();
+        self.covariance -= across * inverse * across.transpose();
+        self.balance();
+        log_density(spread, *innovation)
+    }
+
+    /// What a line corrects, by its measurement equation at a place.
+    fn correction(
+        &self,
+        place: Point3<f64>,
+        bearing: &TrackBearing<'_>,
+        factor: f64,
+        firsts: [Option<usize>; 2],
+    ) -> Option<Correction> {
+        let seen = self.linearised(place, bearing, factor, firsts)?;
+        let across = self.across(&seen);
+        let spread = seen.times(&across) + seen.noise;
+        Some(Correction {
+            inverse: spread.try_inverse()?,
+            across,
+            spread,
+            innovation: seen.innovation,
+            noise_rad: (seen.noise.trace() / 2.0).sqrt(),
+            range: seen.range,
+        })
     }
 
     /// A line's measurement equation at a place; `firsts` are the indices of the camera's errors.

@@ -12,7 +12,6 @@ use super::speeds::{BySpeed, SPEEDS, SpeedCase};
 use crate::evidence::ONE_IN_A_HUNDRED;
 use crate::spatial::{LineId, TYPICAL_SPEED, TimedLine};
 use crate::track::{FusedTrack, TrackBearing};
-use crate::visibility::independent_share;
 
 /// If the clock's uncertainty shifts a camera's bearings by a variance of more than this many times
 /// their own, the test says nothing. With half of it clocks that are 0.7 times as uncertain let
@@ -168,15 +167,14 @@ impl OneTargetTest {
         self.joint = None;
     }
 
-    /// Notes that a camera that should have seen the target has not, `interval_s` seconds after its
-    /// exposure before.
-    pub(super) fn miss(&mut self, camera: &CameraName, log_miss: f64, interval_s: f64) {
+    /// Notes that a camera that should have seen the target has not; this look tells a `share` of
+    /// what one tells that is independent of the camera's look before.
+    pub(super) fn miss(&mut self, camera: &CameraName, log_miss: f64, share: f64) {
         if self.follows(camera) {
             return;
         }
-        // Exposures close together count as one look, and all of them no more than that the camera
-        // never detects this target.
-        let more = log_miss * independent_share(interval_s);
+        // All of them tell no more than that the camera never detects this target.
+        let more = log_miss * share;
         match self.silent.iter_mut().find(|(name, _)| name == camera) {
             Some((_, log)) => *log = (*log + more).max(ONE_IN_A_HUNDRED),
             None => self.silent.push((camera.clone(), more.max(ONE_IN_A_HUNDRED))),
