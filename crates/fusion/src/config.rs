@@ -150,7 +150,8 @@ pub struct Initiation {
     /// Fixes that a group needs to start a track. 1 to `periods`, default 2.
     pub fixes: usize,
     /// How long the bearings of two cameras must agree to start a track that no third camera sees,
-    /// s, for `hypotheses`. 0.001 to 3600. Default 0.3.
+    /// s, for `hypotheses`; looks of a camera that misses a young target within it count as one.
+    /// 0.001 to 3600. Default 0.3.
     pub pair_s: f64,
     /// Standard deviation of the velocity's prior, m/s per axis. 0.001 to 10000. Default 50.
     pub velocity_prior_sd_mps: f64,

@@ -90,7 +90,7 @@ impl Correction {
 impl JointFilter {
     /// What a track knows: its state, and how that is correlated with the cameras' errors.
     pub(super) fn of_track(track: &FusedTrack) -> Self {
-        let mut joint = Self::of_state(&track.state(), track.updated_at);
+        let mut joint = Self::of_state(track.state(), track.updated_at);
         for (camera, tied, lasting_s) in track.shared_ties() {
             for from in PAIRS {
                 let tied = tied.fixed_columns::<PAIR>(from);
@@ -210,11 +210,13 @@ impl JointFilter {
     ///
     /// Iterated, as a track's update is: a target whose speed is not known yet may be anywhere
     /// within the distance that it flies from one exposure to the next. Where the rounds do not
-    /// approach a place, the range is so vague that the first is as good as any other.
+    /// approach a place, or not in time, the range is so vague that the first is as good as any
+    /// other.
     pub(super) fn see(&mut self, bearing: &TrackBearing<'_>, factor: f64) -> Option<f64> {
         let TrackBearing { camera, uncertainty: CameraUncertainty { pose, lasting, .. }, .. } =
             *bearing;
-        let is_there = [pose.is_some(), lasting.sd_rad > 0.0];
+        let has_error = pose.is_some_and(|pose| pose.covariance().amax() > 0.0);
+        let is_there = [has_error, lasting.sd_rad > 0.0];
         let mut firsts = [None; 2];
         for (first, (from, is_there)) in firsts.iter_mut().zip(PAIRS.into_iter().zip(is_there)) {
             if is_there {
@@ -238,13 +240,15 @@ impl JointFilter {
         self.corrected(&at_first)
     }
 
-    /// Applies a correction; returns the logarithm of the line's probability density.
+    /// Applies a correction; returns the logarithm of the line's probability density. `None`, and
+    /// nothing is applied, if the numbers fail.
     fn corrected(&mut self, correction: &Correction) -> Option<f64> {
         let Correction { across, inverse, spread, innovation, .. } = correction;
+        let log_density = log_density(spread, *innovation)?;
         self.mean += across * correction.pull();
         self.covariance -= across * inverse * across.transpose();
         self.balance();
-        log_density(spread, *innovation)
+        Some(log_density)
     }
 
     /// What a line corrects, by its measurement equation at a place.
