@@ -135,8 +135,8 @@ impl PoseScale {
         self.told
     }
 
-    /// Whether the camera's lines miss the others' by far more than its pose explains, or those of
-    /// its site's cameras of undeclared poses all do, or it is likelier to have been moved than not.
+    /// Whether the camera's lines miss the others' by far more than its pose explains, or it is
+    /// likelier to have been moved than not.
     pub(super) fn is_doubted(&self) -> bool {
         self.value > DOUBTED || self.moved.probability > 0.5
     }

@@ -302,8 +302,7 @@ impl Hypotheses {
             comparison.note(&mut hypothesis.track, false);
             let missed = log_missed(self.rules.detection);
             // Looks within the time for which chance may agree count as one.
-            let share =
-                if interval_s < self.pair_s { (interval_s / self.pair_s).max(0.0) } else { 1.0 };
+            let share = (interval_s / self.pair_s).clamp(0.0, 1.0);
             hypothesis.one_target.miss(&comparison.exposure.camera, missed, share);
         }
         next.push(hypothesis);
