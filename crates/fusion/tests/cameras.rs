@@ -399,7 +399,7 @@ fn where_half_of_the_cameras_see_something_steadily_beside_a_target_the_poses_ar
     }
     squares.sort_by(f64::total_cmp);
     assert!(squares.len() >= 15, "{squares:?}");
-    // Three degrees of freedom: a median of 2.4 would be honest. It is 42, and six tracks have two
-    // cameras, where nobody asks what the others see beside.
-    assert!(squares[squares.len() / 2] < 30.0, "{squares:?}");
+    // Three degrees of freedom: a median of 2.4 would be honest. Errors of which half are too small
+    // to show are underestimated: it is 8, and was 10 while no explanation had all poses off.
+    assert!(squares[squares.len() / 2] < 9.0, "{squares:?}");
 }

@@ -90,6 +90,16 @@ pub(super) struct Moved {
     pub(super) factor: f64,
 }
 
+/// What all lines of a site together say of a pose whose deviation nobody has declared.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Surveyed {
+    /// The least factor on its covariance, at most 1.
+    pub(super) least: f64,
+    /// The typical factor of the site's poses, 0 where they are exact: by how much all are worse
+    /// than a careful survey's.
+    pub(super) typical: f64,
+}
+
 /// Factor on a camera's pose covariance, and what it is learnt from.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PoseScale {
@@ -101,6 +111,8 @@ pub(super) struct PoseScale {
     /// Least factor: a declared pose is not made better than it says. For another one it is what
     /// all lines together say ([`super::watch`]).
     least: f64,
+    /// The typical factor of the site's poses, as far as all lines together say.
+    typical: f64,
     /// Whether somebody has declared the pose's deviation.
     is_declared: bool,
     draws: f64,
@@ -118,6 +130,7 @@ impl PoseScale {
             moved: Moved::default(),
             told: 1.0,
             least: 1.0,
+            typical: 0.0,
             is_declared,
             draws: 0.0,
             found: 0.0,
@@ -163,6 +176,7 @@ impl PoseScale {
         // Minorisation-maximisation step of a variance (the mode of its logarithm) with an inverse
         // gamma prior of n degrees of freedom about the typical factor t:
         // factor * sqrt((found + n t / factor) / (expected + n)).
+        let typical = typical.max(self.typical);
         let found = self.found + TYPICAL_WEIGHT * typical / self.value;
         let step = (found / (self.expected + TYPICAL_WEIGHT)).sqrt();
         let step = step.clamp(LARGEST_STEP.recip(), LARGEST_STEP);
@@ -179,12 +193,12 @@ impl PoseScale {
         self.tell()
     }
 
-    /// Takes in the chance that the camera has been moved, and the least factor of a pose that
+    /// Takes in the chance that the camera has been moved, and what all lines say of a pose that
     /// nobody has declared; returns by how much the tracks' factor changes, if it does.
-    pub(super) fn judge(&mut self, moved: Moved, least: Option<f64>) -> Option<f64> {
+    pub(super) fn judge(&mut self, moved: Moved, surveyed: Option<Surveyed>) -> Option<f64> {
         self.moved = moved;
-        if let Some(least) = least {
-            self.least = least;
+        if let Some(Surveyed { least, typical }) = surveyed {
+            (self.least, self.typical) = (least, typical);
             self.value = self.value.max(least);
         }
         self.tell()

@@ -18,7 +18,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix6, SMatrix, Unit, Vector3};
 
 use super::meeting::Meeting;
-use super::pose_scale::Moved;
+use super::pose_scale::{Moved, Surveyed};
 use super::{Cameras, ScaleSample};
 use crate::evidence::ONE_IN_A_HUNDRED;
 use knock::{Knocks, Watched};
@@ -221,14 +221,14 @@ impl ErrorWatch {
         })
     }
 
-    /// The least factor on the covariance of each pose whose deviation nobody has declared, by the
-    /// lines of the shorter memory: errors of image trackers that last for seconds pass for errors
-    /// of a pose, and the longer memory would keep them for minutes.
-    fn least_factors(
+    /// What all lines together say of each pose whose deviation nobody has declared: those of the
+    /// shorter memory. Errors of image trackers that last for seconds pass for errors of a pose,
+    /// and the longer memory would keep them for minutes.
+    fn survey(
         &self,
         estimates: &[ErrorEstimate],
         is_declared: impl Fn(&CameraName) -> bool,
-    ) -> BTreeMap<CameraName, f64> {
+    ) -> BTreeMap<CameraName, Surveyed> {
         let cameras = self.cameras.iter().enumerate();
         let undeclared = cameras.filter(|(_, camera)| !is_declared(&camera.name));
         let judged = undeclared.map(|(place, camera)| survey::Judged {
@@ -236,9 +236,9 @@ impl ErrorWatch {
             clock_sd_s: camera.clock_sd_s,
         });
         let judged = judged.collect();
-        let found = estimates.first().and_then(|latest| survey::least_factors(latest, judged));
+        let found = estimates.first().and_then(|latest| survey::survey(latest, judged));
         let name = |first: usize| self.cameras[first / ERRORS].name.clone();
-        found.into_iter().flatten().map(|(first, least)| (name(first), least)).collect()
+        found.into_iter().flatten().map(|(first, said)| (name(first), said)).collect()
     }
 
     /// The chance that each camera has been moved. Where the lines do not tell which of two cameras
@@ -311,10 +311,10 @@ impl Cameras {
         let estimates = watch.estimates();
         let is_declared =
             |name: &CameraName| by_name.get(name).is_none_or(|own| own.pose_scale.is_declared());
-        let least = watch.least_factors(&estimates, is_declared);
+        let surveyed = watch.survey(&estimates, is_declared);
         let changed = watch.chances(&estimates).into_iter().filter_map(|(name, moved)| {
             let scale = &mut by_name.get_mut(&name)?.pose_scale;
-            let ratio = scale.judge(moved, least.get(&name).copied())?;
+            let ratio = scale.judge(moved, surveyed.get(&name).copied())?;
             Some((name, ratio))
         });
         changed.collect()

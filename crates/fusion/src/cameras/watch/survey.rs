@@ -5,14 +5,15 @@
 //! likely to be small, and by it alone they would be taken for exact. So explanations of all lines
 //! are compared, with the errors themselves integrated out: the poses are as good as a careful
 //! survey's, or all worse by a factor; they are exact; they are exact but for one, or one clock is
-//! off. A factor is not smaller than the mean over those that are likely, where one of a pose that
-//! is off counts as 1: how far it is off is learnt from its own lines ([`super::super::pose_scale`]).
+//! off. A factor is not smaller than the mean over those that are likely, or than 1 if the mean is
+//! larger: how far poses are off is learnt from their own lines, with the mean of what all are worse
+//! by as the typical factor ([`super::super::pose_scale`]).
 
 use nalgebra::{DMatrix, DVector};
 
 use super::memory::ErrorEstimate;
 use super::{CLOCK, ERRORS, FREEDOM};
-use crate::cameras::pose_scale::LEAST_SCALE;
+use crate::cameras::pose_scale::{LEAST_SCALE, Surveyed};
 use crate::evidence::ONE_IN_A_HUNDRED;
 
 /// Probability, before any line, that the poses of a site are as good as a careful survey's.
@@ -35,15 +36,15 @@ const CLOCK_OFF_BY_S: [f64; 3] = [0.01, 0.1, 1.0];
 /// best are taken for exact.
 const OFF_BY: [f64; 4] = [1.0, 10.0, 100.0, 1000.0];
 /// Most cameras whose poses are judged together, as the cost grows with the fourth power; they are
-/// those known best; the errors of all others are a careful survey's. With half of it four cameras, of whose errors lines can tell 17, decide for a
-/// site.
+/// those known best; the errors of all others are a careful survey's. With half of it four cameras,
+/// of whose errors lines can tell 17, decide for a site.
 const MOST_CAMERAS: usize = 8;
 
 /// One explanation of the lines, with the logarithm of its probability up to a constant.
 #[derive(Clone, Copy)]
 enum Explanation {
-    /// All are as good as a careful survey's, or worse.
-    Alike,
+    /// All have this factor (variance) on a careful survey's covariance.
+    Alike(f64),
     Exact,
     /// Exact but for the camera in this place, whose lines its pose or its clock shifts by this
     /// factor (variance) on what a careful survey leaves, as far as they do not tell more.
@@ -82,12 +83,12 @@ struct Told {
     coordinates: f64,
 }
 
-/// The least factor on the pose covariance of each of these cameras, at most 1; each is given by
-/// its first error among all. `None` if the numbers fail.
-pub(super) fn least_factors(
+/// What all lines together say of the pose of each of these cameras; each is given by its first
+/// error among all. `None` if the numbers fail.
+pub(super) fn survey(
     estimate: &ErrorEstimate,
     mut cameras: Vec<Judged>,
-) -> Option<Vec<(usize, f64)>> {
+) -> Option<Vec<(usize, Surveyed)>> {
     // Of a camera of which the lines tell nothing the whole prior is left.
     let left =
         |Judged { first, .. }: &Judged| estimate.covariance.diagonal().rows(*first, ERRORS).sum();
@@ -106,20 +107,27 @@ pub(super) fn least_factors(
         chances.filter(|(_, chance)| *chance > ONE_IN_A_HUNDRED.exp())
     };
     let all: f64 = likely().map(|(_, chance)| chance).sum();
-    let of = |place: Option<usize>| {
+    let mean = |of: &dyn Fn(Explanation) -> f64| {
+        likely().map(|(one, chance)| of(one) * chance).sum::<f64>() / all
+    };
+    let least = |place: Option<usize>| {
         let factor = |one| match one {
-            Explanation::Alike => 1.0,
+            Explanation::Alike(by) => by,
             Explanation::ButOne(off, by) if Some(off) == place => by,
             Explanation::Exact | Explanation::ButOne(..) => 0.0,
         };
-        let mean: f64 = likely().map(|(one, chance)| factor(one) * chance).sum();
-        LEAST_SCALE.max(mean / all)
+        mean(&factor).clamp(LEAST_SCALE, 1.0)
     };
-    let own = judged.iter().enumerate().map(|(place, own)| (own.first, of(Some(place))));
+    let typical = mean(&|one| match one {
+        Explanation::Alike(by) => by,
+        Explanation::Exact | Explanation::ButOne(..) => 0.0,
+    });
+    let said = |Judged { first, .. }: &Judged, least| (*first, Surveyed { least, typical });
+    let own = judged.iter().enumerate().map(|(place, own)| said(own, least(Some(place))));
     // Of any other camera as much is known as before of one of a site that is like these.
     let unknown = (1.0 - CAREFUL_CHANCE) * ONE_OFF_CHANCE / cameras.len() as f64;
-    let other = of(None).max(unknown);
-    Some(own.chain(others.iter().map(|one| (one.first, other))).collect())
+    let other = least(None).max(unknown);
+    Some(own.chain(others.iter().map(|one| said(one, other))).collect())
 }
 
 impl Told {
@@ -148,7 +156,8 @@ impl Told {
         for pose in OFF_BY {
             let alike = vec![Factors { pose, clock: 1.0 }; cameras.len()];
             let chance = CAREFUL_CHANCE / pose;
-            explanations.push((Explanation::Alike, self.log_likelihood(&alike)? + chance.ln()));
+            explanations
+                .push((Explanation::Alike(pose), self.log_likelihood(&alike)? + chance.ln()));
         }
         for (off, camera) in cameras.iter().enumerate() {
             // How far a pose is off that is off alone is learnt from its own lines.
@@ -253,9 +262,9 @@ mod tests {
         let judged = (0..cameras.len())
             .map(|place| Judged { first: ERRORS * place, clock_sd_s: 1e-4 })
             .collect();
-        let mut least = least_factors(&memory.estimate().unwrap(), judged).unwrap();
-        least.sort_by_key(|(first, _)| *first);
-        least.into_iter().map(|(_, least)| least).collect()
+        let mut found = survey(&memory.estimate().unwrap(), judged).unwrap();
+        found.sort_by_key(|(first, _)| *first);
+        found.into_iter().map(|(_, found)| found.least).collect()
     }
 
     /// By hand: 0.1 for careful, and for exact but this one 0.9 x 0.1 / n; that all are worse, or a
@@ -309,7 +318,7 @@ mod tests {
     /// What the lines of two cameras with these errors of their poses (in deviations of a careful
     /// survey) and their clocks (in units of 0.1 ms) say, with this many coordinates on each error,
     /// and with a factor on the variance of their noise.
-    fn said(cameras: [[f64; 2]; 2], coordinates: f64, noise: f64) -> Vec<f64> {
+    fn said(cameras: [[f64; 2]; 2], coordinates: f64, noise: f64) -> Vec<Surveyed> {
         let mut memory = Memory::default();
         memory.widen(2 * ERRORS);
         let all = coordinates * 2.0 * ERRORS as f64;
@@ -326,24 +335,26 @@ mod tests {
         }
         memory.add_squares(squares, all);
         let judged = [0, ERRORS].map(|first| Judged { first, clock_sd_s: 1e-4 });
-        let mut least = least_factors(&memory.estimate().unwrap(), judged.to_vec()).unwrap();
-        least.sort_by_key(|(first, _)| *first);
-        least.into_iter().map(|(_, least)| least).collect()
+        let mut found = survey(&memory.estimate().unwrap(), judged.to_vec()).unwrap();
+        found.sort_by_key(|(first, _)| *first);
+        found.into_iter().map(|(_, found)| found).collect()
     }
 
     #[test]
     fn poses_that_are_all_off_are_no_exact_ones_but_one() {
         let found = said([[10.0, 0.0], [-10.0, 0.0]], 10.0, 1.0);
-        assert!(found.iter().all(|least| *least > 0.99), "{found:?}");
+        assert!(found.iter().all(|of| of.least > 0.99), "{found:?}");
+        // Ten deviations of a careful survey are a hundred of its variance.
+        assert!(found.iter().all(|of| (30.0..300.0).contains(&of.typical)), "{found:?}");
         // Misses as large that come and go are noise.
         let found = said([[0.1, 0.0], [-0.1, 0.0]], 10.0, 10_000.0);
-        assert!(found.iter().all(|least| *least < 0.2), "{found:?}");
+        assert!(found.iter().all(|of| of.least < 0.2 && of.typical < 1.0), "{found:?}");
     }
 
     #[test]
     fn a_clock_that_is_off_leaves_the_other_camera_exact() {
         let found = said([[0.0, 300.0], [0.0, 0.0]], 10.0, 1.0);
         // 30 ms shift its lines by three deviations of a careful survey's pose.
-        assert!(found[0] > 0.99 && found[1] < 1e-5, "{found:?}");
+        assert!(found[0].least > 0.99 && found[1].least < 1e-5, "{found:?}");
     }
 }
