@@ -93,7 +93,7 @@ fn a_lucky_pose_is_not_taken_for_an_exact_one() {
 }
 
 /// Where the poses are exact, the lines show it: the tracks then claim what exact bearings would be
-/// good for, far less than a careful survey's 0.15 m at 150 m. In one site of ten they may miss
+/// good for, far less than a careful survey's 0.15 m at 150 m. In one site of twenty they may miss
 /// each other by chance as those of a camera that is off.
 #[test]
 fn exact_poses_are_found_to_be_exact() {
@@ -109,7 +109,7 @@ fn exact_poses_are_found_to_be_exact() {
             assert!(squares / (late.len() as f64) < 3.0, "{cameras}, seed {seed}: {squares}");
         }
         let unsure = claims.iter().filter(|metres| **metres >= most_m).count();
-        assert!(unsure <= SITES as usize / 10, "{cameras} cameras: {claims:?}");
+        assert!(unsure <= SITES as usize / 20, "{cameras} cameras: {claims:?}");
         let mean = claims.iter().sum::<f64>() / claims.len() as f64;
         assert!(mean < most_m, "{cameras} cameras: {mean} m");
     }
