@@ -285,14 +285,18 @@ impl Hypotheses {
         // The likeliest continuation, with a bearing or without.
         let best = near.first().map_or(miss, |likeliest| likeliest.ratio.max(miss));
         let likely = |one: &Candidate| one.ratio > miss && one.ratio > best - BEYOND_DOUBT;
-        let likely = near.into_iter().filter(likely).take(BOUNDS.branches);
-        let before = next.len();
-        next.extend(likely.filter_map(|candidate| {
-            self.continued_with(candidate, hypothesis.clone(), comparison, prediction.as_ref())
-        }));
-        if miss <= best - BEYOND_DOUBT && next.len() > before {
+        let likely: Vec<_> = near.into_iter().filter(likely).take(BOUNDS.branches).collect();
+        let continued = |candidate, hypothesis| {
+            self.continued_with(candidate, hypothesis, comparison, prediction.as_ref())
+        };
+        // Copies are most of what a hypothesis costs: one that does not go on without a bearing
+        // becomes its last continuation.
+        if let (true, Some((last, others))) = (miss <= best - BEYOND_DOUBT, likely.split_last()) {
+            next.extend(others.iter().filter_map(|one| continued(*one, hypothesis.clone())));
+            next.extend(continued(*last, hypothesis));
             return;
         }
+        next.extend(likely.into_iter().filter_map(|one| continued(one, hypothesis.clone())));
         if is_expected {
             // ln(1 - P(visible) P_D); against one target per camera, ln(1 - P_D) alone.
             hypothesis.track.score += miss;
