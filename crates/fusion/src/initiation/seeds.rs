@@ -12,6 +12,7 @@ use super::passing::{Passing, Passings};
 use super::rooted_lines::RootedLines;
 use super::{NamedLine, lines_with_pose};
 use crate::cameras::{Cameras, KnownCamera, Rooted};
+use crate::evidence::BEYOND_DOUBT;
 use crate::prediction::BearingPrediction;
 use crate::spatial::{LineId, MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::{Exposure, FusionConfig, Initiation};
@@ -267,12 +268,17 @@ impl SeedFinder {
             branched |= next.len() > 1;
             open = next;
         }
-        let mut found = Vec::new();
-        for (set, solution) in open {
-            if let Some(seed) = self.seed(growing, &set, solution) {
-                found.push((set, seed));
-            }
-        }
+        let seeds = open.into_iter().filter_map(|(set, solution)| {
+            let seed = self.seed(growing, &set, solution)?;
+            Some((set, seed))
+        });
+        let mut found: Vec<_> = seeds.collect();
+        // They share two lines, so that one of them at most is a target: the likeliest is beyond
+        // doubt where another is less likely by that much, as one that leaves out a camera whose
+        // line fits is. Not so of the two lines alone: a great speed explains the line of a third
+        // camera that is turned.
+        let best = found.iter().map(|(_, seed)| seed.score).fold(f64::NEG_INFINITY, f64::max);
+        found.retain(|(set, seed)| set.len() == 2 || seed.score > best - BEYOND_DOUBT);
         found
     }
 
