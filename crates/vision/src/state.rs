@@ -148,8 +148,8 @@ impl TargetBelief {
     pub(crate) fn note_noise(&mut self, noise: f32, interval: f64) {
         // A low pass with this time constant, and the first image as it is.
         let share = if self.is_new { 1.0 } else { (1.0 - (-interval / NOISE_S).exp()) as f32 };
-        // As a mean, which lies between both: of a difference rounding would leave nothing where one
-        // is far larger than the other, and no noise at all has no logarithm.
+        // A mean lies between both: of a difference rounding would leave 0 where one is far larger
+        // than the other, and 0 has no logarithm.
         self.noise = (1.0 - share) * self.noise + share * noise;
     }
 

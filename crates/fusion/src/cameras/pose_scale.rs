@@ -95,9 +95,9 @@ pub(super) struct Moved {
 pub(super) struct Surveyed {
     /// The least factor on its covariance, at most 1.
     pub(super) least: f64,
-    /// The typical factor of the site's poses, 0 where they are exact: by how much all are worse
-    /// than a careful survey's.
-    pub(super) typical: f64,
+    /// By how much (variance) all poses are worse than a careful survey's, in the mean over the
+    /// explanations, of which those without count as 0.
+    pub(super) all_worse_by: f64,
 }
 
 /// Factor on a camera's pose covariance, and what it is learnt from.
@@ -111,8 +111,9 @@ pub(super) struct PoseScale {
     /// Least factor: a declared pose is not made better than it says. For another one it is what
     /// all lines together say ([`super::watch`]).
     least: f64,
-    /// The typical factor of the site's poses, as far as all lines together say.
-    typical: f64,
+    /// By how much all poses of the site are worse than a careful survey's: the typical factor is
+    /// this at least.
+    all_worse_by: f64,
     /// Whether somebody has declared the pose's deviation.
     is_declared: bool,
     draws: f64,
@@ -130,7 +131,7 @@ impl PoseScale {
             moved: Moved::default(),
             told: 1.0,
             least: 1.0,
-            typical: 0.0,
+            all_worse_by: 0.0,
             is_declared,
             draws: 0.0,
             found: 0.0,
@@ -176,7 +177,7 @@ impl PoseScale {
         // Minorisation-maximisation step of a variance (the mode of its logarithm) with an inverse
         // gamma prior of n degrees of freedom about the typical factor t:
         // factor * sqrt((found + n t / factor) / (expected + n)).
-        let typical = typical.max(self.typical);
+        let typical = typical.max(self.all_worse_by);
         let found = self.found + TYPICAL_WEIGHT * typical / self.value;
         let step = (found / (self.expected + TYPICAL_WEIGHT)).sqrt();
         let step = step.clamp(LARGEST_STEP.recip(), LARGEST_STEP);
@@ -197,8 +198,8 @@ impl PoseScale {
     /// nobody has declared; returns by how much the tracks' factor changes, if it does.
     pub(super) fn judge(&mut self, moved: Moved, surveyed: Option<Surveyed>) -> Option<f64> {
         self.moved = moved;
-        if let Some(Surveyed { least, typical }) = surveyed {
-            (self.least, self.typical) = (least, typical);
+        if let Some(Surveyed { least, all_worse_by }) = surveyed {
+            (self.least, self.all_worse_by) = (least, all_worse_by);
             self.value = self.value.max(least);
         }
         self.tell()
@@ -287,5 +288,27 @@ impl ScaleSample {
             found: error.norm_squared(),
             expected: (pose.transpose() * told * pose).trace(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: a camera's own lines say 1; with a weight of 0.2 of 100, and of 1 of its own, the
+    /// factor v fulfils v = (1 + 0.2 x 100) / 1.2.
+    #[test]
+    fn a_factor_is_drawn_to_what_all_poses_of_the_site_are_worse_by() {
+        let [alone, drawn] = [0.0, 100.0].map(|all_worse_by| {
+            let mut scale = PoseScale::new(false);
+            scale.judge(Moved::default(), Some(Surveyed { least: LEAST_SCALE, all_worse_by }));
+            for _ in 0..300 {
+                let error = SquaredPoseError { found: 1.0 / scale.value, expected: 1.0 };
+                scale.learn(error, 1.0);
+            }
+            scale.value
+        });
+        assert!((alone - 1.0).abs() < 0.01, "{alone}");
+        assert!((drawn - 21.0 / 1.2).abs() < 0.5, "{drawn}");
     }
 }

@@ -178,7 +178,7 @@ impl Hypothesis {
 impl Hypotheses {
     pub(super) fn new(config: &FusionConfig) -> Self {
         Self {
-            finder: SeedFinder::new(config, 2, LEAST_SCORE),
+            finder: SeedFinder::of_likely(config, LEAST_SCORE),
             rules: ComparisonRules::new(config),
             confirm_score: config.tracking.confirm_score,
             span: config.initiation.periods as u64,
@@ -290,8 +290,10 @@ impl Hypotheses {
             self.continued_with(candidate, hypothesis, comparison, prediction.as_ref())
         };
         // Copies are most of what a hypothesis costs: one that does not go on without a bearing
-        // becomes its last continuation.
-        if let (true, Some((last, others))) = (miss <= best - BEYOND_DOUBT, likely.split_last()) {
+        // becomes its last continuation, and is given up if the numbers fail.
+        if miss <= best - BEYOND_DOUBT
+            && let Some((last, others)) = likely.split_last()
+        {
             next.extend(others.iter().filter_map(|one| continued(*one, hypothesis.clone())));
             next.extend(continued(*last, hypothesis));
             return;

@@ -79,6 +79,8 @@ pub(crate) struct SeedFinder {
     set_gates: Vec<f64>,
     least_cameras: usize,
     least_score: f64,
+    /// How much less likely than the best of those that share two lines a set may be.
+    margin: f64,
 }
 
 /// The lines of a period, from which sets are grown.
@@ -127,9 +129,18 @@ impl Growing<'_> {
 }
 
 impl SeedFinder {
-    /// A search for sets of at least `least_cameras` cameras with a log-likelihood ratio above
-    /// `least_score`.
-    pub(crate) fn new(config: &FusionConfig, least_cameras: usize, least_score: f64) -> Self {
+    /// A search for sets of at least two cameras with a log-likelihood ratio above `least_score`,
+    /// but for those that others leave no doubt about.
+    pub(crate) fn of_likely(config: &FusionConfig, least_score: f64) -> Self {
+        Self { margin: BEYOND_DOUBT, ..Self::new(config, 2, least_score) }
+    }
+
+    /// A search for all sets of at least `least_cameras` cameras.
+    pub(crate) fn of_all(config: &FusionConfig, least_cameras: usize) -> Self {
+        Self::new(config, least_cameras, f64::NEG_INFINITY)
+    }
+
+    fn new(config: &FusionConfig, least_cameras: usize, least_score: f64) -> Self {
         let initiation = config.initiation.clone();
         let line_gate = Gate::with_probability(initiation.spatial_gate_probability);
         // 2 n coordinates and three terms of the velocity's prior, less six unknowns: 2 n - 3
@@ -147,10 +158,11 @@ impl SeedFinder {
             set_gates,
             least_cameras,
             least_score,
+            margin: f64::INFINITY,
         }
     }
 
-    /// All seeds of one period, the likeliest first; what stands in the views may be a target where
+    /// The seeds of one period, the likeliest first; what stands in the views may be a target where
     /// `rooted_lines` say that they do not cross by chance. `is_held` tells of a line whether
     /// something that has been followed before goes on with it.
     pub(crate) fn find(
@@ -229,7 +241,8 @@ impl SeedFinder {
         pairs.into_iter().map(|(_, pair)| pair).collect()
     }
 
-    /// The seeds that grow from two lines, with their sets of lines.
+    /// The seeds that grow from two lines, with their sets of lines, but for those that are less
+    /// likely than the best of them by the margin.
     fn sets_of(&self, growing: &Growing<'_>, both: [LineIndex; 2]) -> Vec<(Vec<LineIndex>, Seed)> {
         let Some(pair) = self.solve(&both.map(|at| growing.line(at).1.clone())) else {
             return Vec::new();
@@ -273,12 +286,12 @@ impl SeedFinder {
             Some((set, seed))
         });
         let mut found: Vec<_> = seeds.collect();
-        // They share two lines, so that one of them at most is a target: the likeliest is beyond
-        // doubt where another is less likely by that much, as one that leaves out a camera whose
-        // line fits is. Not so of the two lines alone: a great speed explains the line of a third
-        // camera that is turned.
+        // All these sets share two lines, so that one of them at most is a target's: a set that is
+        // far less likely than the best, as one that leaves out a camera whose line fits, is not.
+        // The two lines alone may be all the same: where a third camera is turned, a great speed
+        // explains its line too, and the set of three looks better than it is.
         let best = found.iter().map(|(_, seed)| seed.score).fold(f64::NEG_INFINITY, f64::max);
-        found.retain(|(set, seed)| set.len() == 2 || seed.score > best - BEYOND_DOUBT);
+        found.retain(|(set, seed)| set.len() == 2 || seed.score > best - self.margin);
         found
     }
 

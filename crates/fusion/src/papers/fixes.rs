@@ -29,10 +29,7 @@ pub(super) struct FixFinder {
 
 impl FixFinder {
     pub(super) fn new(config: &FusionConfig) -> Self {
-        Self {
-            config: config.initiation.clone(),
-            seeds: SeedFinder::new(config, 3, f64::NEG_INFINITY),
-        }
+        Self { config: config.initiation.clone(), seeds: SeedFinder::of_all(config, 3) }
     }
 
     /// Every fix that the exposures of one period can make.
