@@ -79,7 +79,7 @@ pub(crate) struct SeedFinder {
     set_gates: Vec<f64>,
     least_cameras: usize,
     least_score: f64,
-    /// How much less likely than the best of those that share two lines a set may be.
+    /// How much less likely (logarithm) a set may be than the best of those that share two lines.
     margin: f64,
 }
 

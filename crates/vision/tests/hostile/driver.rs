@@ -98,6 +98,11 @@ fn is_sound(track: &ImageTrack) -> bool {
         && track.score.is_finite()
         && track.certainty.is_finite()
         && track.nis.is_none_or(f64::is_finite)
+        && track.features.is_none_or(|features| {
+            [features.contrast, features.flicker, features.straightness]
+                .iter()
+                .all(|v| v.is_finite())
+        })
         && track
             .covariances
             .is_none_or(|axes| axes.iter().all(|c| c.iter().all(|v| v.is_finite()) && c.m11 > 0.0))
