@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_message::{CameraName, Solver, Timestamp};
 
+use super::first_lines::{FirstLine, FirstLines};
 use super::one_target::{Mobility, OneTargetTest};
 use super::rooted_lines::RootedLines;
 use super::seeds::{Seed, SeedFinder};
@@ -361,7 +362,16 @@ impl Hypotheses {
             let mut track = Box::new(FusedTrack::start(&fix, named, motion));
             track.score = seed.score;
             let place = fix.state.position();
-            let one_target = OneTargetTest::begin(&seed.lines, place, self.speed, seed.score);
+            let first_lines = seed.lines.iter().filter_map(|(id, solved)| {
+                Some(FirstLine {
+                    camera: id.camera.clone(),
+                    line: id.sighting_in(exposures)?.line,
+                    uncertainty: *uncertainty.get(&id.camera)?,
+                    solved: solved.clone(),
+                })
+            });
+            let first = FirstLines::of_seed(first_lines, place, self.speed, seed.score);
+            let one_target = OneTargetTest::begin(first);
             let mut said = BTreeMap::new();
             for (id @ LineId { camera, .. }, _) in &seed.lines {
                 let Some(own) = id.sighting_in(exposures) else { continue };

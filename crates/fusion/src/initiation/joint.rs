@@ -4,51 +4,63 @@
 mod tests;
 
 use crossfix_filter::{KinematicState, process_noise};
-use crossfix_geometry::BearingModel;
+use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{
-    DMatrix, DVector, Dyn, Matrix2, Matrix2x3, Matrix3, OMatrix, Point3, U2, Vector2, Vector3,
+    DMatrix, DVector, Dyn, Matrix2, Matrix2x3, Matrix3, Matrix6, OMatrix, Point3, U2, Vector2,
+    Vector3, Vector6,
 };
 
 use crate::prediction::log_density;
 use crate::track::{FusedTrack, TrackBearing};
-use crate::uncertainty::{CameraUncertainty, LASTING};
+use crate::uncertainty::{CameraUncertainty, LASTING, OF_CLOCK, SHARED};
 use crate::update::{MAX_ROUNDS, SETTLED};
 
-/// Most pairs of errors that are estimated with the target: poses and lasting errors of four
-/// cameras, or poses alone of eight; further ones count as noise of each line. With half of it what
-/// a third camera shows is taken for less than it is; with twice as much a hypothesis takes three
-/// times the memory.
-const MAX_PAIRS: usize = 8;
+/// Most errors that are estimated with the target: all of four cameras, or poses and clocks of six;
+/// further ones count as noise of each line. With half of it what a third camera shows is taken for
+/// less than it is; with twice as much a hypothesis takes three times the memory.
+const MAX_ERRORS: usize = 4 * SHARED;
 /// Position and velocity.
 const STATE: usize = 6;
-/// Errors in a pair: one along each tangent.
-const PAIR: usize = 2;
-/// Index of the first of a pair among the errors that a camera's lines share: of the pose, and of
-/// those that last.
-const PAIRS: [usize; 2] = [0, LASTING];
 
 /// Kalman filter for position and velocity of a target and for the shared errors of its cameras.
 ///
 /// A track only considers those errors, so what it expects of a line is less than its lines so far
-/// tell: one wrong pose would count anew in every line. The clock's error counts as noise of each
-/// line here, as its effect is not known before the velocity is.
+/// tell: one wrong pose would count anew in every line. What a clock's error does to a line is not
+/// known before the velocity is: until then that counts as noise.
 #[derive(Clone, Debug)]
 pub(super) struct JointFilter {
     time: Timestamp,
-    /// The errors that follow position and velocity in `mean`, in units of their own deviations.
-    pairs: Vec<ErrorPair>,
+    /// The cameras whose errors follow position and velocity in `mean`, in units of their own
+    /// deviations.
+    cameras: Vec<CameraErrors>,
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
+    /// The velocity by which clocks shift lines, where it is known from later lines.
+    flown: Option<Flown>,
 }
 
-/// Two errors that lines of a camera share, one along each tangent.
+/// How fast a target flies, m/s.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Flown {
+    velocity: Vector3<f64>,
+    covariance: Matrix3<f64>,
+}
+
+impl Flown {
+    /// Mean variance per axis, m^2/s^2.
+    pub(super) fn variance(&self) -> f64 {
+        self.covariance.trace() / 3.0
+    }
+}
+
+/// The errors that all lines of a camera share.
 #[derive(Clone, Debug)]
-struct ErrorPair {
+struct CameraErrors {
     camera: CameraName,
-    /// Index of the first of them among the camera's errors.
-    from: usize,
-    /// Decay time of errors that last, s; a pose's do not decay.
+    /// The place of each of them in the filter's state, as far as it is estimated.
+    places: [Option<usize>; SHARED],
+    /// Decay time of errors that last, s; the others do not decay.
     decay_s: f64,
 }
 
@@ -56,8 +68,8 @@ struct ErrorPair {
 struct Linearised {
     /// Jacobian by the position.
     by: Matrix2x3<f64>,
-    /// Jacobians by the camera's errors that are estimated, each with the index of the first.
-    shifts: [Option<(usize, Matrix2<f64>)>; 2],
+    /// Jacobian by each of the camera's errors that is estimated, with its place in the state.
+    shifts: [Option<(usize, Vector2<f64>)>; SHARED],
     noise: Matrix2<f64>,
     innovation: Vector2<f64>,
     /// Distance of the place from the camera, m.
@@ -92,28 +104,38 @@ impl JointFilter {
     pub(super) fn of_track(track: &FusedTrack) -> Self {
         let mut joint = Self::of_state(track.state(), track.updated_at);
         for (camera, tied, lasting_s) in track.shared_ties() {
-            for from in PAIRS {
-                let tied = tied.fixed_columns::<PAIR>(from);
-                // What is tied to nothing is met as new.
-                if tied.amax() == 0.0 {
-                    continue;
-                }
-                let Some(first) = joint.find_or_add(camera, from, lasting_s) else { break };
+            // What is tied to nothing is met as new.
+            let is_there = std::array::from_fn(|error| tied.column(error).amax() > 0.0);
+            let places = joint.find_or_add(camera, is_there, lasting_s);
+            for (tied, place) in tied.column_iter().zip(places) {
+                let Some(place) = place else { continue };
                 let covariance = &mut joint.covariance;
-                covariance.fixed_view_mut::<STATE, PAIR>(0, first).copy_from(&tied);
-                covariance.fixed_view_mut::<PAIR, STATE>(first, 0).copy_from(&tied.transpose());
+                covariance.fixed_view_mut::<STATE, 1>(0, place).copy_from(&tied);
+                covariance.fixed_view_mut::<1, STATE>(place, 0).copy_from(&tied.transpose());
             }
         }
         joint
+    }
+
+    /// A target at about this place (standard deviation in m per axis), that may be this fast (m/s).
+    pub(super) fn at(place: Point3<f64>, place_sd: f64, speed: f64, time: Timestamp) -> Self {
+        let mut state = KinematicState { mean: Vector6::zeros(), covariance: Matrix6::zeros() };
+        state.mean.fixed_rows_mut::<3>(0).copy_from(&place.coords);
+        for axis in 0..3 {
+            state.covariance[(axis, axis)] = place_sd.powi(2);
+            state.covariance[(axis + 3, axis + 3)] = speed.powi(2);
+        }
+        Self::of_state(&state, time)
     }
 
     /// A state that is correlated with no camera's errors.
     fn of_state(state: &KinematicState, time: Timestamp) -> Self {
         Self {
             time,
-            pairs: Vec::new(),
+            cameras: Vec::new(),
             mean: DVector::from_column_slice(state.mean.as_slice()),
             covariance: DMatrix::from_column_slice(STATE, STATE, state.covariance.as_slice()),
+            flown: None,
         }
     }
 
@@ -145,28 +167,60 @@ impl JointFilter {
         self.mean.fixed_rows::<3>(0).into_owned().into()
     }
 
+    /// How fast the target flies, as far as its lines have told.
+    pub(super) fn flown(&self) -> Flown {
+        let covariance = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        Flown { velocity: self.velocity(), covariance }
+    }
+
+    /// Takes it to be known, or no longer, how fast the target flies, for what clocks do to lines.
+    pub(super) fn assume_flown(&mut self, flown: Option<Flown>) {
+        self.flown = flown;
+    }
+
+    /// Whether it is known how far an uncertain clock of this deviation (s) shifts a line, to
+    /// better than the line's own noise; by the velocity at the target's range.
+    pub(super) fn knows_shift(&self, line: &SightLine, time_sd_s: f64) -> bool {
+        let range = (self.place() - line.origin).norm();
+        let unsure = self.flown().variance() * (time_sd_s / range).powi(2);
+        unsure < line.covariance.trace() / 2.0
+    }
+
     fn velocity(&self) -> Vector3<f64> {
         self.mean.fixed_rows::<3>(3).into_owned()
     }
 
-    /// Index of the first of a pair of a camera's errors, of which nothing is known but their
-    /// deviations if they are new; `None` if they count as noise.
-    fn find_or_add(&mut self, camera: &CameraName, from: usize, lasting_s: f64) -> Option<usize> {
-        let decay_s = if from == LASTING { lasting_s } else { f64::INFINITY };
-        let known = self.pairs.iter().position(|pair| pair.from == from && pair.camera == *camera);
-        if let Some(place) = known {
-            self.pairs[place].decay_s = decay_s;
-            return Some(STATE + PAIR * place);
+    /// The place of each of a camera's errors that is there; of one that is new nothing is known
+    /// but its deviation. `None` for those that count as noise.
+    fn find_or_add(
+        &mut self,
+        camera: &CameraName,
+        is_there: [bool; SHARED],
+        decay_s: f64,
+    ) -> [Option<usize>; SHARED] {
+        let known = self.cameras.iter().position(|errors| errors.camera == *camera);
+        let index = known.unwrap_or_else(|| {
+            let places = [None; SHARED];
+            self.cameras.push(CameraErrors { camera: camera.clone(), places, decay_s });
+            self.cameras.len() - 1
+        });
+        let errors = &mut self.cameras[index];
+        errors.decay_s = decay_s;
+        let size = self.mean.len();
+        let mut added = 0;
+        for (place, is_there) in errors.places.iter_mut().zip(is_there) {
+            if is_there && place.is_none() && size + added < STATE + MAX_ERRORS {
+                *place = Some(size + added);
+                added += 1;
+            }
         }
-        if self.pairs.len() == MAX_PAIRS {
-            return None;
+        let places = errors.places;
+        if added > 0 {
+            self.mean.resize_vertically_mut(size + added, 0.0);
+            self.covariance.resize_mut(size + added, size + added, 0.0);
+            self.covariance.view_mut((size, size), (added, added)).fill_with_identity();
         }
-        self.pairs.push(ErrorPair { camera: camera.clone(), from, decay_s });
-        let first = self.mean.len();
-        self.mean.resize_vertically_mut(first + PAIR, 0.0);
-        self.covariance.resize_mut(first + PAIR, first + PAIR, 0.0);
-        self.covariance.fixed_view_mut::<PAIR, PAIR>(first, first).fill_with_identity();
-        Some(first)
+        std::array::from_fn(|error| places[error].filter(|_| is_there[error]))
     }
 
     /// Predicts to a time: constant velocity driven by white acceleration of this density, m^2/s^3.
@@ -186,9 +240,9 @@ impl JointFilter {
             let mut place = self.covariance.column_mut(axis);
             place += speed;
         }
-        for (place, pair) in self.pairs.iter().enumerate().filter(|(_, p)| p.decay_s.is_finite()) {
-            let kept = (-dt.abs() / pair.decay_s).exp();
-            for error in (0..PAIR).map(|tangent| STATE + PAIR * place + tangent) {
+        for CameraErrors { places, decay_s, .. } in &self.cameras {
+            let kept = (-dt.abs() / decay_s).exp();
+            for error in places[LASTING..].iter().copied().flatten() {
                 self.mean[error] *= kept;
                 self.covariance.row_mut(error).scale_mut(kept);
                 self.covariance.column_mut(error).scale_mut(kept);
@@ -213,18 +267,13 @@ impl JointFilter {
     /// approach a place, or not in time, the range is so vague that the first is as good as any
     /// other.
     pub(super) fn see(&mut self, bearing: &TrackBearing<'_>, factor: f64) -> Option<f64> {
-        let TrackBearing { camera, uncertainty: CameraUncertainty { pose, lasting, .. }, .. } =
-            *bearing;
-        let has_error = pose.is_some_and(|pose| pose.covariance().amax() > 0.0);
-        let is_there = [has_error, lasting.sd_rad > 0.0];
-        let mut firsts = [None; 2];
-        for (first, (from, is_there)) in firsts.iter_mut().zip(PAIRS.into_iter().zip(is_there)) {
-            if is_there {
-                *first = self.find_or_add(camera, from, lasting.time_s);
-            }
-        }
+        let TrackBearing { camera, uncertainty, .. } = *bearing;
+        let has_error = uncertainty.pose.is_some_and(|pose| pose.covariance().amax() > 0.0);
+        let lasts = uncertainty.lasting.sd_rad > 0.0;
+        let is_there = [has_error, has_error, uncertainty.time_sd_s > 0.0, lasts, lasts];
+        let places = self.find_or_add(camera, is_there, uncertainty.lasting.time_s);
         let before = self.place();
-        let at_first = self.correction(before, bearing, factor, firsts)?;
+        let at_first = self.correction(before, bearing, factor, places)?;
         let mut correction = at_first.clone();
         let (mut place, mut moved_before) = (before, f64::INFINITY);
         for _ in 0..MAX_ROUNDS {
@@ -233,7 +282,7 @@ impl JointFilter {
             if moved.powi(2) < SETTLED * correction.noise_rad {
                 return self.corrected(&correction);
             }
-            let next_one = self.correction(next, bearing, factor, firsts);
+            let next_one = self.correction(next, bearing, factor, places);
             let Some(next_one) = next_one.filter(|_| moved < moved_before) else { break };
             (place, moved_before, correction) = (next, moved, next_one);
         }
@@ -257,9 +306,9 @@ impl JointFilter {
         place: Point3<f64>,
         bearing: &TrackBearing<'_>,
         factor: f64,
-        firsts: [Option<usize>; 2],
+        places: [Option<usize>; SHARED],
     ) -> Option<Correction> {
-        let seen = self.linearised(place, bearing, factor, firsts)?;
+        let seen = self.linearised(place, bearing, factor, places)?;
         let across = self.across(&seen);
         let spread = seen.times(&across) + seen.noise;
         Some(Correction {
@@ -272,39 +321,48 @@ impl JointFilter {
         })
     }
 
-    /// A line's measurement equation at a place; `firsts` are the indices of the camera's errors.
+    /// A line's measurement equation at a place of the target; `places` are those of the camera's
+    /// errors.
     fn linearised(
         &self,
         place: Point3<f64>,
         &TrackBearing { line, uncertainty, .. }: &TrackBearing<'_>,
         factor: f64,
-        firsts: [Option<usize>; 2],
+        places: [Option<usize>; SHARED],
     ) -> Option<Linearised> {
         let model = BearingModel::new(line.origin, place)?;
-        let own = model.covariance_of(line) * (factor / uncertainty.factor).max(1.0);
-        let camera = CameraUncertainty { clock_is_noise: true, ..*uncertainty };
-        let all = camera.shifts(&model, self.velocity());
-        let mut noise = camera.noise(&model, self.velocity(), &own);
+        let camera = CameraUncertainty { clock_is_noise: false, ..*uncertainty };
+        let Flown { velocity, covariance: unsure } = self.flown.unwrap_or_else(|| self.flown());
+        let all = camera.shifts(&model, velocity);
         let by = model.by_position();
+        let mut noise = model.covariance_of(line) * factor.max(uncertainty.factor);
         let mut innovation = model.residual(line)? + by * (place - self.place());
-        let mut shifts = [None; 2];
-        for (index, from) in PAIRS.into_iter().enumerate() {
-            let shift: Matrix2<f64> = all.fixed_columns::<PAIR>(from).into_owned();
-            if let Some(first) = firsts[index] {
-                innovation -= shift * self.mean.fixed_rows::<PAIR>(first);
-                shifts[index] = Some((first, shift));
+        let mut shifts = [None; SHARED];
+        for ((shift, own), place) in shifts.iter_mut().zip(all.column_iter()).zip(places) {
+            let own: Vector2<f64> = own.into_owned();
+            if let Some(place) = place {
+                innovation -= own * self.mean[place];
+                *shift = Some((place, own));
             } else {
-                noise += shift * shift.transpose();
+                noise += own * own.transpose();
             }
         }
+        // What the clock's error t does by the velocity's error: its mean square is
+        // (E' P_v E) (mean^2 + variance of t) / r^2.
+        let square = places[OF_CLOCK].map_or(1.0, |clock| {
+            self.mean[clock].powi(2) + self.covariance[(clock, clock)].max(0.0)
+        });
+        noise += by * unsure * by.transpose() * (square * uncertainty.time_sd_s.powi(2));
         Some(Linearised { by, shifts, noise, innovation, range: model.range })
     }
 
     /// P G', with G the line's Jacobian by all that is estimated.
     fn across(&self, Linearised { by, shifts, .. }: &Linearised) -> OMatrix<f64, Dyn, U2> {
         let mut across = self.covariance.fixed_columns::<3>(0) * by.transpose();
-        for (first, shift) in shifts.iter().flatten() {
-            across += self.covariance.fixed_columns::<PAIR>(*first) * shift.transpose();
+        for (error, shift) in shifts.iter().flatten() {
+            for (tangent, by) in shift.iter().enumerate() {
+                across.column_mut(tangent).axpy(*by, &self.covariance.column(*error), 1.0);
+            }
         }
         across
     }
@@ -325,8 +383,8 @@ impl Linearised {
     /// G times a matrix with a row for each of what is estimated.
     fn times(&self, across: &OMatrix<f64, Dyn, U2>) -> Matrix2<f64> {
         let mut product = self.by * across.fixed_rows::<3>(0);
-        for (first, shift) in self.shifts.iter().flatten() {
-            product += shift * across.fixed_rows::<PAIR>(*first);
+        for (error, shift) in self.shifts.iter().flatten() {
+            product += shift * across.row(*error);
         }
         product
     }

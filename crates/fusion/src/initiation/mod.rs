@@ -3,10 +3,12 @@
 //! found either by following hypotheses ([`Hypotheses`]) or, as in Klochko 2020, by
 //! solving each period for fixes and grouping these ([`Grouped`]).
 
+mod first_lines;
 mod handover;
 mod hypotheses;
 mod joint;
 mod one_target;
+mod own_sights;
 mod passing;
 mod period;
 mod rooted_lines;

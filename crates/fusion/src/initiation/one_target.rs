@@ -1,21 +1,21 @@
 //! Test whether lines of several cameras belong to one target, or each camera sees a target of its
 //! own.
 
-use crossfix_geometry::SightLine;
-use crossfix_message::{CameraName, Timestamp};
-use nalgebra::Point3;
+use crossfix_message::CameraName;
 
-use super::NamedLine;
+use super::first_lines::{FirstLines, LaterLine};
 use super::joint::JointFilter;
+use super::own_sights::OwnSights;
 use super::sight::DirectionFilter;
-use super::speeds::{BySpeed, SPEEDS, SpeedCase};
+use super::speeds::{BySpeed, SPEEDS};
 use crate::evidence::ONE_IN_A_HUNDRED;
-use crate::spatial::{LineId, TYPICAL_SPEED, TimedLine};
+use crate::spatial::TYPICAL_SPEED;
 use crate::track::{FusedTrack, TrackBearing};
 
-/// If the clock's uncertainty shifts a camera's bearings by a variance of more than this many times
-/// their own, the test says nothing. With half of it clocks that are 0.7 times as uncertain let
-/// lines that cross by chance pass untested.
+/// Where one camera sees a target after the other, and the clock's uncertainty shifts its bearings
+/// by a variance of more than this many times their own, the test says nothing. With half of it
+/// targets are handed over only by clocks that are 0.7 times as uncertain; with a hundred times as
+/// much, of ten targets before three cameras with clocks of 30 ms two things at rest become one.
 const INCONCLUSIVE: f64 = 10.0;
 
 /// How a target may move.
@@ -25,14 +25,6 @@ pub(super) struct Mobility {
     pub(super) density: f64,
     /// Standard deviation of its speed, m/s.
     pub(super) speed: f64,
-}
-
-/// A first line of something that one camera alone sees, and that may move across the line at up to
-/// `rate_sd` (rad/s, standard deviation).
-fn first_sight(line: &SightLine, time: Timestamp, rate_sd: f64) -> BySpeed<DirectionFilter> {
-    BySpeed::new(SPEEDS.map(|SpeedCase { share, log_prior }| {
-        (DirectionFilter::first(line, time, share * rate_sd), log_prior)
-    }))
 }
 
 /// A target as its track knows it, by the speed that it may have; before any line that was `speed`,
@@ -56,69 +48,52 @@ fn joint_of(track: &FusedTrack, speed: f64) -> BySpeed<JointFilter> {
 ///
 /// Both are predictive likelihoods: of models that are right, the ratio would exceed T with a
 /// probability of 1 / T at most where each camera sees something of its own, however long one
-/// looks. Not all of it is counted so: a camera's first line is compared with clutter, and a line
-/// outside the gate is a miss.
-#[derive(Clone, Debug)]
+/// looks. Not all of it is counted so: a camera's first line is compared with clutter, as is one
+/// that continues nothing that the camera has seen before, and a line outside the gate is a miss.
+#[derive(Clone, Debug, Default)]
 pub(super) struct OneTargetTest {
-    /// Each camera's lines, followed as if that camera alone saw the target.
-    sights: Vec<(CameraName, BySpeed<DirectionFilter>)>,
+    /// Each camera's lines, followed as if that camera alone saw what gives them.
+    own: OwnSights,
+    /// The lines that it began with: until there is another, or it is known how far uncertain
+    /// clocks shift them.
+    first: Option<FirstLines>,
     /// All lines, followed as one target's; from the second ones on.
     joint: Option<BySpeed<JointFilter>>,
     /// Cameras that should see the target and have given one line at most, with the log-likelihood
     /// of their misses.
     silent: Vec<(CameraName, f64)>,
     log_ratio: f64,
+    /// Whether one camera has followed the target before the others see it.
+    is_handed_over: bool,
     /// Whether clocks are so uncertain that the test says nothing.
     inconclusive: bool,
 }
 
 impl OneTargetTest {
-    /// The test for the lines of a seed, with its log-likelihood ratio; at `place` the target may
-    /// have a speed of `speed` (m/s, standard deviation).
-    pub(super) fn begin(
-        lines: &[NamedLine],
-        place: Point3<f64>,
-        speed: f64,
-        log_ratio: f64,
-    ) -> Self {
-        let sights = lines.iter().map(|(LineId { camera, .. }, TimedLine { line, time, .. })| {
-            // A speed of v across the line turns it at v / r.
-            let range = (place - line.origin).norm();
-            (camera.clone(), first_sight(line, *time, speed / range))
-        });
-        Self {
-            sights: sights.collect(),
-            joint: None,
-            silent: Vec::new(),
-            log_ratio,
-            inconclusive: false,
+    /// The test for the lines of a seed.
+    pub(super) fn begin(first: FirstLines) -> Self {
+        let mut own = OwnSights::default();
+        for (camera, seen, rate_sd) in first.sights() {
+            own.begin(camera, &seen.line, seen.time, rate_sd);
         }
+        let log_ratio = first.score();
+        let test = Self { own, log_ratio, ..Self::default() };
+        Self { first: Some(first), ..test }
     }
 
     /// The test for what one camera alone has followed so far.
     pub(super) fn of_one(camera: &CameraName, sight: DirectionFilter) -> Self {
-        Self {
-            sights: vec![(camera.clone(), BySpeed::new([(sight, 0.0)]))],
-            joint: None,
-            silent: Vec::new(),
-            log_ratio: 0.0,
-            inconclusive: false,
-        }
+        let own = OwnSights::of_one(camera, sight);
+        Self { own, is_handed_over: true, ..Self::default() }
     }
 
     /// Whether a line of this camera has been used.
     pub(super) fn knows(&self, camera: &CameraName) -> bool {
-        self.sights.iter().any(|(name, _)| name == camera)
+        self.own.knows(camera)
     }
 
-    /// Whether a camera has given more than one line: a first one may be clutter, whatever it fits.
-    fn follows(&self, camera: &CameraName) -> bool {
-        let own = self.sights.iter().find(|(name, _)| name == camera);
-        own.and_then(|(_, sight)| sight.fastest()).is_some_and(|sight| !sight.is_first())
-    }
-
-    /// Adds a camera's first line, with its log-likelihood ratio; the target may move across it at
-    /// `rate_sd` (rad/s, standard deviation).
+    /// Adds a camera's first line of an object, with its log-likelihood ratio; the target may move
+    /// across it at `rate_sd` (rad/s, standard deviation).
     pub(super) fn see_first(
         &mut self,
         TrackBearing { camera, time, line, .. }: &TrackBearing<'_>,
@@ -126,7 +101,7 @@ impl OneTargetTest {
         first_ratio: f64,
     ) {
         self.log_ratio += first_ratio;
-        self.sights.push(((*camera).clone(), first_sight(line, *time, rate_sd)));
+        self.own.begin(camera, line, *time, rate_sd);
     }
 
     /// Adds a line that continues the target, whose track is as before that line. `ratio` is its
@@ -142,35 +117,71 @@ impl OneTargetTest {
     ) {
         let TrackBearing { camera, time, line, uncertainty } = *bearing;
         let range = (before.position_at(time) - line.origin).norm();
-        let joint = self.joint.get_or_insert_with(|| joint_of(before, speed));
-        joint.each(|joint| joint.predict(time, density));
-        let Some((_, sight)) = self.sights.iter_mut().find(|(name, _)| name == camera) else {
-            joint.see(|joint| joint.see(bearing, uncertainty.factor));
-            return self.see_first(bearing, speed / range, ratio);
-        };
-        sight.each(|sight| sight.predict(time, density / range.powi(2)));
-        let shown = sight.fastest().map_or(1.0, DirectionFilter::factor);
-        let factor = shown.max(uncertainty.factor);
-        let together = joint.see(|joint| joint.see(bearing, factor));
-        let alone = sight.see(|sight| sight.log_density(line, factor));
-        self.log_ratio += together.zip(alone).map_or(0.0, |(one, own)| one - own).min(ratio);
         // The shift by an uncertain clock is not known before the velocity is: use a typical speed.
         // Var = (v sd(t) / r)^2 per tangent.
         let clock = (speed * TYPICAL_SPEED * uncertainty.time_sd_s / range).powi(2);
-        self.inconclusive |= clock > INCONCLUSIVE * line.covariance.trace() / 2.0;
-        sight.each(|sight| sight.update(line));
+        let is_unsure = clock > INCONCLUSIVE * line.covariance.trace() / 2.0;
+        self.inconclusive |= self.is_handed_over && is_unsure;
+        let turning = density / range.powi(2);
+        let own = self.own.likeliest(camera, line, time, turning, uncertainty.factor);
+        let factor = own.map_or(uncertainty.factor, |own| own.factor);
+        let joint = self.joint(before, speed);
+        joint.each(|joint| joint.predict(time, density));
+        let together = joint.see(|joint| joint.see(bearing, factor));
+        let gained = |log_density: f64| together.map_or(0.0, |together| together - log_density);
+        let own = own.filter(|own| gained(own.log_density) <= ratio);
+        if let Some(own) = own {
+            self.log_ratio += gained(own.log_density);
+            self.own.go_on(own, line);
+        } else {
+            // It continues nothing that the camera alone sees.
+            self.see_first(bearing, speed / range, ratio);
+        }
+        if self.first.is_some() {
+            let alone = own.map(|own| own.log_density);
+            self.learn_clocks(LaterLine::new(bearing, factor, density, alone, ratio));
+        }
+    }
+
+    /// The target that gives all lines, by the speed that it may have.
+    fn joint(&mut self, before: &FusedTrack, speed: f64) -> &mut BySpeed<JointFilter> {
+        self.joint.get_or_insert_with(|| {
+            let begun = self.first.as_ref().and_then(|first| first.by_speed(None));
+            self.first.take_if(|first| begun.is_none() || !first.have_unsure_clocks());
+            let (joint, log_ratio) =
+                begun.unwrap_or_else(|| (joint_of(before, speed), self.log_ratio));
+            self.log_ratio = log_ratio;
+            joint
+        })
+    }
+
+    /// Takes in all lines once more where this one has made the velocity, by which uncertain clocks
+    /// shift them, twice as well known.
+    fn learn_clocks(&mut self, later: LaterLine) {
+        let (Some(first), Some(joint)) = (&mut self.first, &self.joint) else { return };
+        let is_told = joint.fastest().is_some_and(|joint| later.is_shift_known(joint));
+        let has_room = first.keep(later);
+        if joint.fastest().is_some_and(|joint| first.learn_velocity(joint))
+            && let Some((joint, log_ratio)) = first.by_speed(Some(joint))
+        {
+            (self.joint, self.log_ratio) = (Some(joint), log_ratio);
+        }
+        if is_told || !has_room {
+            self.first = None;
+        }
     }
 
     /// Notes that the track has taken in a line that says nothing here.
     pub(super) fn pass_over(&mut self) {
         // What the track knows by then is begun with anew.
         self.joint = None;
+        self.first = None;
     }
 
     /// Notes that a camera that should have seen the target has not; this look tells a `share` of
     /// what one tells that is independent of the camera's look before.
     pub(super) fn miss(&mut self, camera: &CameraName, log_miss: f64, share: f64) {
-        if self.follows(camera) {
+        if self.own.follows(camera) {
             return;
         }
         // All of them tell no more than that the camera never detects this target.
@@ -186,7 +197,7 @@ impl OneTargetTest {
         if self.inconclusive {
             return None;
         }
-        let silent = self.silent.iter().filter(|(camera, _)| !self.follows(camera));
+        let silent = self.silent.iter().filter(|(camera, _)| !self.own.follows(camera));
         Some(self.log_ratio + silent.map(|(_, log)| log).sum::<f64>())
     }
 }

@@ -22,6 +22,13 @@ pub(super) const SPEEDS: [SpeedCase; 3] = [
     SpeedCase { share: 1.0, log_prior: 0.0 },
 ];
 
+impl SpeedCase {
+    /// Logarithm of the sum of the cases' probabilities.
+    pub(super) fn log_all() -> f64 {
+        SPEEDS.iter().map(|case| case.log_prior.exp()).sum::<f64>().ln()
+    }
+}
+
 /// A filter for each case, with the logarithm of its probability (up to a constant).
 #[derive(Clone, Debug)]
 pub(super) struct BySpeed<F> {
@@ -35,9 +42,27 @@ impl<F> BySpeed<F> {
         Self { cases: cases.into_iter().collect() }
     }
 
+    /// Logarithm of the sum of the cases' probabilities; `None` if there are none.
+    pub(super) fn log_total(&self) -> Option<f64> {
+        log_sum(self.cases.iter().map(|(_, log)| *log))
+    }
+
     /// The filter of what moves as fast as anything.
     pub(super) fn fastest(&self) -> Option<&F> {
         self.cases.last().map(|(filter, _)| filter)
+    }
+
+    /// Logarithm of the probability density of something, over all cases, of which each says its
+    /// own; `None` if it fails in all.
+    pub(super) fn log_density(&self, density: impl Fn(&F) -> Option<f64>) -> Option<f64> {
+        let weighted = self.cases.iter().filter_map(|(filter, log)| Some(log + density(filter)?));
+        let weighted: Vec<f64> = weighted.collect();
+        Some(log_sum(weighted.iter().copied())? - self.log_total()?)
+    }
+
+    /// The filter of each case.
+    pub(super) fn filters(&self) -> impl Iterator<Item = &F> {
+        self.cases.iter().map(|(filter, _)| filter)
     }
 
     /// Changes the filter of each case.

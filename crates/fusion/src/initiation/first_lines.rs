@@ -1,0 +1,207 @@
+//! The lines that a possible target begins with, and how well they are one target's.
+
+use std::sync::Arc;
+
+use crossfix_geometry::SightLine;
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::Point3;
+
+use super::joint::{Flown, JointFilter};
+use super::speeds::{BySpeed, SPEEDS, SpeedCase};
+use crate::spatial::TimedLine;
+use crate::track::TrackBearing;
+use crate::uncertainty::CameraUncertainty;
+
+/// Most lines that are kept until it is known how far clocks shift them: a second of two cameras
+/// of 12 Hz. With half of it targets of quick cameras, whose lines tell of the velocity more
+/// slowly, are found later where clocks are 0.1 s off.
+const MAX_LATER: usize = 24;
+
+/// A line of a seed.
+#[derive(Clone, Debug)]
+pub(super) struct FirstLine {
+    pub(super) camera: CameraName,
+    pub(super) line: SightLine,
+    pub(super) uncertainty: CameraUncertainty,
+    /// The same line as the seed was solved from it: with all that is uncertain of its camera as
+    /// noise.
+    pub(super) solved: TimedLine,
+}
+
+/// A line that came after those of the seed.
+#[derive(Clone, Debug)]
+pub(super) struct LaterLine {
+    camera: CameraName,
+    time: Timestamp,
+    line: SightLine,
+    uncertainty: CameraUncertainty,
+    /// How many times its reported covariance counts.
+    factor: f64,
+    /// Density of the target's acceleration before it, m^2/s^3.
+    density: f64,
+    /// Logarithm of its probability density if the camera alone sees what gives it, 1/sr; `None`
+    /// for the first line of an object.
+    alone: Option<f64>,
+    /// Its log-likelihood ratio against clutter.
+    ratio: f64,
+}
+
+impl LaterLine {
+    pub(super) fn new(
+        TrackBearing { camera, time, line, uncertainty }: &TrackBearing<'_>,
+        factor: f64,
+        density: f64,
+        alone: Option<f64>,
+        ratio: f64,
+    ) -> Self {
+        let (line, uncertainty) = (**line, **uncertainty);
+        let camera = (*camera).clone();
+        Self { camera, time: *time, line, uncertainty, factor, density, alone, ratio }
+    }
+
+    /// Whether the target's velocity is known so well that it is known how far the camera's clock
+    /// shifts the line, to better than the line's own noise.
+    pub(super) fn is_shift_known(&self, joint: &JointFilter) -> bool {
+        joint.knows_shift(&self.line, self.uncertainty.time_sd_s)
+    }
+
+    /// What it says for one target, of which it has this log probability density.
+    fn gained(&self, together: Option<f64>) -> f64 {
+        let gained = self.alone.map(|alone| together.map_or(0.0, |together| together - alone));
+        gained.map_or(self.ratio, |gained| gained.min(self.ratio))
+    }
+}
+
+/// The lines of a seed, and those after them for as long as it is not known how far uncertain
+/// clocks shift them.
+///
+/// A seed is solved as if its target were fast and an uncertain clock shifted each line by as much
+/// as a fast target flies in that time. Of a target at rest, whose lines no clock shifts, they say
+/// more than that; and of one that flies, as soon as its velocity is known.
+#[derive(Clone, Debug)]
+pub(super) struct FirstLines {
+    /// Where the target is about.
+    place: Point3<f64>,
+    /// Its speed before any line, m/s (standard deviation per axis).
+    speed: f64,
+    /// The log-likelihood ratio of the seed.
+    score: f64,
+    // Shared by all hypotheses that grow from the seed.
+    lines: Arc<[FirstLine]>,
+    later: Vec<Arc<LaterLine>>,
+    /// Variance to which the velocity was known when the lines were last taken in, m^2/s^2.
+    known: f64,
+}
+
+impl FirstLines {
+    /// The lines of a seed of this log-likelihood ratio, of a target about this place; before any
+    /// line its speed was `speed`, m/s (standard deviation per axis).
+    pub(super) fn of_seed(
+        lines: impl Iterator<Item = FirstLine>,
+        place: Point3<f64>,
+        speed: f64,
+        score: f64,
+    ) -> Self {
+        Self {
+            place,
+            speed,
+            score,
+            lines: lines.collect(),
+            later: Vec::new(),
+            known: speed.powi(2),
+        }
+    }
+
+    pub(super) fn score(&self) -> f64 {
+        self.score
+    }
+
+    /// Each camera's line, with the greatest rate at which the target may move across it, rad/s
+    /// (standard deviation).
+    pub(super) fn sights(&self) -> impl Iterator<Item = (&CameraName, &TimedLine, f64)> {
+        self.lines.iter().map(|FirstLine { camera, solved, .. }| {
+            // A speed of v across the line turns it at v / r.
+            let range = (self.place - solved.line.origin).norm();
+            (camera, solved, self.speed / range)
+        })
+    }
+
+    /// Whether a clock shifts any of them.
+    pub(super) fn have_unsure_clocks(&self) -> bool {
+        self.lines.iter().any(|first| first.uncertainty.time_sd_s > 0.0)
+    }
+
+    /// Whether the velocity is known twice as well as when the lines were last taken in.
+    pub(super) fn learn_velocity(&mut self, joint: &JointFilter) -> bool {
+        let known = joint.flown().variance();
+        let is_better = known < self.known / 4.0;
+        if is_better {
+            self.known = known;
+        }
+        is_better
+    }
+
+    /// Keeps a later line; returns whether there is room for another.
+    pub(super) fn keep(&mut self, line: LaterLine) -> bool {
+        self.later.push(Arc::new(line));
+        self.later.len() < MAX_LATER
+    }
+
+    /// The target that gives these lines, by the speed that it may have, and their log-likelihood
+    /// ratio. `known` is the same as it was found before, which tells how fast it flies: by that
+    /// clocks shift the lines. `None` if the numbers fail.
+    pub(super) fn by_speed(
+        &self,
+        known: Option<&BySpeed<JointFilter>>,
+    ) -> Option<(BySpeed<JointFilter>, f64)> {
+        let flown = known.map_or_else(Vec::new, |known| {
+            known.filters().map(|joint| Some(joint.flown())).collect()
+        });
+        let cases = SPEEDS.iter().enumerate().map(|(case, SpeedCase { share, log_prior })| {
+            let flown = flown.get(case).copied().flatten();
+            let own = |first: &FirstLine| (first.line, first.uncertainty);
+            let (joint, log) = self.followed(share * self.speed, flown, own)?;
+            Some((joint, log_prior + log))
+        });
+        let mut cases = BySpeed::new(cases.collect::<Option<Vec<_>>>()?);
+        let as_solved = |FirstLine { solved, .. }: &FirstLine| {
+            let range = (self.place - solved.line.origin).norm();
+            let covariance = solved.noise_at(range, self.speed);
+            (SightLine { covariance, ..solved.line }, CameraUncertainty::of_time(0.0))
+        };
+        let (_, solved) = self.followed(self.speed, None, as_solved)?;
+        let mut log_ratio = self.score + cases.log_total()? - SpeedCase::log_all() - solved;
+        for later in &self.later {
+            let LaterLine { camera, time, line, uncertainty, factor, density, .. } = &**later;
+            let bearing = TrackBearing { camera, time: *time, line, uncertainty };
+            cases.each(|joint| joint.predict(*time, *density));
+            log_ratio += later.gained(cases.see(|joint| joint.see(&bearing, *factor)));
+        }
+        cases.each(|joint| joint.assume_flown(None));
+        Some((cases, log_ratio))
+    }
+
+    /// A target of at most this speed (m/s) that gives the seed's lines, each taken in a certain
+    /// way, and the logarithm of their probability density, up to a constant that is the same for
+    /// all speeds and ways.
+    fn followed(
+        &self,
+        speed: f64,
+        flown: Option<Flown>,
+        taken: impl Fn(&FirstLine) -> (SightLine, CameraUncertainty),
+    ) -> Option<(JointFilter, f64)> {
+        let solved = &self.lines.first()?.solved;
+        // Anywhere between the camera and twice as far: two lines leave far less of it.
+        let range = (self.place - solved.line.origin).norm();
+        let mut joint = JointFilter::at(self.place, range, speed, solved.time);
+        joint.assume_flown(flown);
+        let mut sum = 0.0;
+        for first @ FirstLine { camera, solved: TimedLine { time, .. }, .. } in &*self.lines {
+            let (line, uncertainty) = &taken(first);
+            joint.predict(*time, 0.0);
+            let bearing = TrackBearing { camera, time: *time, line, uncertainty };
+            sum += joint.see(&bearing, uncertainty.factor)?;
+        }
+        Some((joint, sum))
+    }
+}
