@@ -1,6 +1,6 @@
 //! A site of which everything is drawn.
 
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::PI;
 use std::fmt;
 
 use crossfix_geometry::{
@@ -15,6 +15,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Poisson, StandardNormal};
 
 use super::Wishes;
+use super::flight::Flight;
+use super::hardship::Hardship;
 
 /// How long each site is looked at, s.
 pub const DURATION_S: f64 = 40.0;
@@ -63,84 +65,7 @@ pub struct DrawnCamera {
     clutter: f64,
     /// How far its clock is ahead, s.
     clock_s: f64,
-}
-
-/// How a target flies.
-enum Flight {
-    Straight {
-        from: Point3<f64>,
-        velocity: Vector3<f64>,
-    },
-    Hovering {
-        at: Point3<f64>,
-        sway_m: f64,
-        rate: f64,
-    },
-    Circling {
-        around: Point3<f64>,
-        radius_m: f64,
-        rate: f64,
-    },
-    /// Now here, now there, along a path that never closes.
-    Wandering {
-        around: Point3<f64>,
-        reach_m: f64,
-        rates: [f64; 3],
-        phases: [f64; 3],
-    },
-}
-
-impl Flight {
-    /// A flight near a place, before cameras that are so far away.
-    fn draw(middle: Point3<f64>, radius_m: f64, random: &mut ChaCha8Rng) -> Self {
-        let reach_m = 0.3 * radius_m;
-        let around = middle + Vector3::from_fn(|_, _| random.random_range(-0.5..0.5)) * reach_m;
-        // No faster than from the middle to the cameras in ten seconds, nor than such targets fly.
-        let speed = random.random_range(0.02..0.1) * radius_m.min(300.0);
-        match random.random_range(0..4) {
-            0 => {
-                let towards = random.random_range(0.0..TAU);
-                let climb = random.random_range(-0.1..0.1);
-                let velocity = Vector3::new(towards.cos(), towards.sin(), climb) * speed;
-                Self::Straight { from: around - velocity * (DURATION_S / 2.0), velocity }
-            }
-            1 => {
-                let sway_m = 10f64.powf(random.random_range(-2.0..0.0));
-                Self::Hovering { at: around, sway_m, rate: random.random_range(0.2..1.0) }
-            }
-            2 => {
-                let radius_m = random.random_range(0.3..1.0) * reach_m;
-                Self::Circling { around, radius_m, rate: speed / radius_m }
-            }
-            _ => {
-                let mut rates = [0.0; 3];
-                rates.fill_with(|| speed / reach_m * random.random_range(0.5..1.5));
-                let mut phases = [0.0; 3];
-                phases.fill_with(|| random.random_range(0.0..TAU));
-                Self::Wandering { around, reach_m, rates, phases }
-            }
-        }
-    }
-
-    /// Where it is at a time after the beginning, s.
-    fn at(&self, t: f64) -> Point3<f64> {
-        match self {
-            Self::Straight { from, velocity } => from + velocity * t,
-            Self::Hovering { at, sway_m, rate } => {
-                let sway =
-                    Vector3::new((rate * t).sin(), (1.3 * rate * t).cos(), (0.7 * rate * t).sin());
-                at + sway * *sway_m
-            }
-            Self::Circling { around, radius_m, rate } => {
-                let (north, east) = (rate * t).sin_cos();
-                around + Vector3::new(east, north, 0.0) * *radius_m
-            }
-            Self::Wandering { around, reach_m, rates, phases } => {
-                let of = |axis: usize| (rates[axis] * t + phases[axis]).sin();
-                around + Vector3::new(of(0), of(1), 0.3 * of(2)) * *reach_m
-            }
-        }
-    }
+    hardship: Hardship,
 }
 
 /// A site of which everything is drawn: its cameras, what flies before it, and what goes wrong.
@@ -168,12 +93,16 @@ impl DrawnSite {
         let clock_sd_s = if random.random() { CLOCK_SD_S } else { 0.0 };
         let poses = wishes.poses.unwrap_or(poses);
         let middle = Point3::new(0.0, 0.0, radius_m * random.random_range(0.15..0.5));
-        let cameras = (0..wishes.cameras.unwrap_or(cameras))
+        let mut cameras = (0..wishes.cameras.unwrap_or(cameras))
             .map(|index| camera(index, poses, clock_sd_s, radius_m, middle, &mut random))
-            .collect::<Result<_, _>>()?;
+            .collect::<Result<Vec<_>, _>>()?;
+        let fly = if wishes.hard { Flight::draw_hard } else { Flight::draw };
         let flights = (0..wishes.targets.unwrap_or(targets))
-            .map(|_| Flight::draw(middle, radius_m, &mut random))
+            .map(|_| fly(middle, radius_m, &mut random))
             .collect();
+        if wishes.hard {
+            cameras.iter_mut().for_each(|camera| camera.hardship = Hardship::draw(&mut random));
+        }
         Ok(Self { poses, cameras, middle, clock_sd_s, flights, random })
     }
 
@@ -185,9 +114,11 @@ impl DrawnSite {
         self.flights.iter().map(|flight| flight.at(t)).collect()
     }
 
-    /// How many cameras have a place in their view.
-    pub fn seen_by(&self, place: Point3<f64>) -> usize {
-        self.cameras.iter().filter(|camera| camera.truth.sees(place)).count()
+    /// How many cameras have a place in their view at a time.
+    pub fn seen_by(&self, place: Point3<f64>, time: Timestamp) -> usize {
+        let t = time.seconds() - BEGINS_S;
+        let sees = |camera: &&DrawnCamera| camera.truth.sees(place) && !camera.hardship.hides_at(t);
+        self.cameras.iter().filter(sees).count()
     }
 
     /// All frames, in the order of their exposures.
@@ -195,16 +126,19 @@ impl DrawnSite {
         let mut frames = Vec::new();
         for camera in &self.cameras {
             let count = ((DURATION_S - camera.phase_s) * camera.rate_hz) as u64;
+            let mut lasting = vec![Vector2::zeros(); self.flights.len()];
             for sequence in 0..count {
                 let t = camera.phase_s + sequence as f64 / camera.rate_hz;
                 let places: Vec<_> = self.flights.iter().map(|flight| flight.at(t)).collect();
-                let reported = Timestamp::from_seconds(BEGINS_S + t + camera.clock_s);
+                let reported = Timestamp::from_seconds(
+                    BEGINS_S + t + camera.clock_s + camera.hardship.clock_s,
+                );
                 let frame = BearingFrame {
                     camera: camera.name.to_string(),
                     sequence,
                     capture_time_ns: reported.nanos(),
                     capture_time_sd_s: self.clock_sd_s,
-                    tracks: camera.bearings(&places, &mut self.random),
+                    tracks: camera.bearings(t, &places, &mut lasting, &mut self.random),
                     ..Default::default()
                 };
                 frames.push((t, frame));
@@ -222,25 +156,20 @@ impl fmt::Display for DrawnSite {
         for camera in &self.cameras {
             let DrawnCamera { rate_hz, sd_rad, detection, clutter, .. } = camera;
             let (away, mrad) = ((camera.said.pose().position() - self.middle).norm(), sd_rad * 1e3);
-            write!(f, "{away:.0} m {rate_hz:.0} Hz {mrad:.1} mrad {detection:.2} {clutter:.1}; ")?;
+            write!(f, "{away:.0} m {rate_hz:.0} Hz {mrad:.1} mrad {detection:.2} {clutter:.1}")?;
+            write!(f, "{}; ", camera.hardship)?;
         }
         write!(f, "clocks {} s;", self.clock_sd_s)?;
         for flight in &self.flights {
             let speed = (flight.at(20.1) - flight.at(20.0)).norm() / 0.1;
-            let kind = match flight {
-                Flight::Straight { .. } => "straight",
-                Flight::Hovering { .. } => "hovering",
-                Flight::Circling { .. } => "circling",
-                Flight::Wandering { .. } => "wandering",
-            };
-            write!(f, " {kind} {speed:.1} m/s")?;
+            write!(f, " {} {speed:.1} m/s", flight.kind())?;
         }
         Ok(())
     }
 }
 
 /// A number of which each factor is as likely as any other.
-fn between(least: f64, most: f64, random: &mut ChaCha8Rng) -> f64 {
+pub fn between(least: f64, most: f64, random: &mut ChaCha8Rng) -> f64 {
     random.random_range(least.ln()..most.ln()).exp()
 }
 
@@ -282,11 +211,12 @@ fn camera(
         detection: random.random_range(0.5..0.98),
         clutter: between(0.05, 2.0, random),
         clock_s: normal(random).x * clock_sd_s,
+        hardship: Hardship::NONE,
     })
 }
 
 /// Three normal numbers.
-fn normal(random: &mut ChaCha8Rng) -> Vector3<f64> {
+pub fn normal(random: &mut ChaCha8Rng) -> Vector3<f64> {
     Vector3::from_fn(|_, _| StandardNormal.sample(random))
 }
 
@@ -298,12 +228,20 @@ impl DrawnCamera {
         if poses == Poses::Declared { message.with_pose_sd(turn, shift) } else { message }
     }
 
-    /// What it reports of these places, and what is nothing.
-    fn bearings(&self, places: &[Point3<f64>], random: &mut ChaCha8Rng) -> Vec<BearingTrack> {
+    /// What it reports of these places at a time after the beginning, s, and what is nothing;
+    /// `lasting` are the errors of its bearings of each that last.
+    fn bearings(
+        &self,
+        t: f64,
+        places: &[Point3<f64>],
+        lasting: &mut [Vector2<f64>],
+        random: &mut ChaCha8Rng,
+    ) -> Vec<BearingTrack> {
+        let is_hidden = self.hardship.hides_at(t);
         let mut directions = Vec::new();
-        for place in places {
-            let noise: Vector2<f64> = normal(random).xy() * self.sd_rad;
-            if random.random::<f64>() < self.detection && self.truth.sees(*place) {
+        for (place, lasting) in places.iter().zip(lasting) {
+            let noise = self.hardship.noise(self.sd_rad, 1.0 / self.rate_hz, lasting, random);
+            if !is_hidden && random.random::<f64>() < self.detection && self.truth.sees(*place) {
                 let exact = Unit::new_normalize(self.truth.pose().camera_from_world(*place));
                 directions.push(exact.into_inner() + tangent_basis(&exact) * noise);
             }

@@ -57,7 +57,7 @@ impl Tally {
             found.extend(self.answer(track, &site.targets_at(track.updated_at)));
         }
         for (index, place) in site.targets_at(now).into_iter().enumerate() {
-            if site.seen_by(place) >= 2 {
+            if site.seen_by(place, now) >= 2 {
                 self.targets += 1;
                 self.found += usize::from(found.contains(&index));
             }
