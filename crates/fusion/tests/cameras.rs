@@ -186,7 +186,7 @@ fn a_camera_worse_than_it_says_counts_less() {
 }
 
 /// When a target is found, s, where the third of three cameras is turned about one of its axes, rad;
-/// and whether a track was anywhere else by then.
+/// and whether at any time there were tracks and none on the target.
 fn found_after_s(
     path: common::Path,
     axis: Vector3<f64>,
@@ -214,8 +214,9 @@ fn found_after_s(
 }
 
 /// A great speed explains the line of a turned camera in each period anew. For as long as such a
-/// set of three kept the two good cameras' pair waiting, nothing was found in forty seconds. By half
-/// a degree nothing is wrong beside the third line; by 5 mrad it is near enough to be in doubt.
+/// set of three kept the two good cameras' pair waiting, nothing was found in forty seconds. Turned by 5
+/// mrad, five times what an undeclared pose is taken to be off by, the third camera's line is near
+/// enough to be in doubt, and one track in fifty begins beside the target.
 #[test]
 fn two_of_three_cameras_find_a_target_while_the_third_is_turned() {
     const SEEDS: u64 = 12;

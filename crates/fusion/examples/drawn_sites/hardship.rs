@@ -49,20 +49,23 @@ impl Hardship {
     }
 
     /// The error of a bearing whose camera reports a deviation of `sd_rad` per axis; `lasting` is
-    /// the part that lasts, and was that of the target's bearing `interval_s` before.
+    /// the part that lasts, and was that of the target's bearing `interval_s` before, if there was
+    /// one.
     pub fn noise(
         &self,
         sd_rad: f64,
         interval_s: f64,
-        lasting: &mut Vector2<f64>,
+        lasting: &mut Option<Vector2<f64>>,
         random: &mut ChaCha8Rng,
     ) -> Vector2<f64> {
         let mut noise = normal(random).xy() * sd_rad;
         if self.lasting > 0.0 {
             let kept = (-interval_s).exp();
             let drawn = normal(random).xy() * sd_rad;
-            *lasting = *lasting * kept + drawn * (1.0 - kept.powi(2)).sqrt();
-            noise = noise * (1.0 - self.lasting).sqrt() + *lasting * self.lasting.sqrt();
+            let goes_on =
+                |before: Vector2<f64>| before * kept + drawn * (1.0 - kept.powi(2)).sqrt();
+            let now = *lasting.insert(lasting.map_or(drawn, goes_on));
+            noise = noise * (1.0 - self.lasting).sqrt() + now * self.lasting.sqrt();
         }
         noise * self.understated
     }

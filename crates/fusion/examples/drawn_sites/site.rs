@@ -107,7 +107,7 @@ impl DrawnSite {
     }
 
     /// Where each target is when the clocks on average read a time. Without a better clock nobody
-    /// can know that they are all ahead.
+    /// can know that they are all ahead. One that is ahead without a word is not counted in this.
     pub fn targets_at(&self, time: Timestamp) -> Vec<Point3<f64>> {
         let ahead_s: f64 = self.cameras.iter().map(|camera| camera.clock_s).sum();
         let t = time.seconds() - BEGINS_S - ahead_s / self.cameras.len() as f64;
@@ -126,7 +126,7 @@ impl DrawnSite {
         let mut frames = Vec::new();
         for camera in &self.cameras {
             let count = ((DURATION_S - camera.phase_s) * camera.rate_hz) as u64;
-            let mut lasting = vec![Vector2::zeros(); self.flights.len()];
+            let mut lasting = vec![None; self.flights.len()];
             for sequence in 0..count {
                 let t = camera.phase_s + sequence as f64 / camera.rate_hz;
                 let places: Vec<_> = self.flights.iter().map(|flight| flight.at(t)).collect();
@@ -234,7 +234,7 @@ impl DrawnCamera {
         &self,
         t: f64,
         places: &[Point3<f64>],
-        lasting: &mut [Vector2<f64>],
+        lasting: &mut [Option<Vector2<f64>>],
         random: &mut ChaCha8Rng,
     ) -> Vec<BearingTrack> {
         let is_hidden = self.hardship.hides_at(t);

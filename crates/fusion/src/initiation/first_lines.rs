@@ -1,6 +1,6 @@
 //! The lines that a possible target begins with, and how well they are one target's.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
@@ -40,7 +40,7 @@ pub(super) struct LaterLine {
     /// Density of the target's acceleration before it, m^2/s^3.
     density: f64,
     /// Logarithm of its probability density if the camera alone sees what gives it, 1/sr; `None`
-    /// for the first line of an object.
+    /// for the camera's first line.
     alone: Option<f64>,
     /// Its log-likelihood ratio against clutter.
     ratio: f64,
@@ -59,12 +59,6 @@ impl LaterLine {
         Self { camera, time: *time, line, uncertainty, factor, density, alone, ratio }
     }
 
-    /// Whether the target's velocity is known so well that it is known how far the camera's clock
-    /// shifts the line, to better than the line's own noise.
-    pub(super) fn is_shift_known(&self, joint: &JointFilter) -> bool {
-        joint.knows_shift(&self.line, self.uncertainty.time_sd_s)
-    }
-
     /// What it says for one target, of which it has this log probability density.
     fn gained(&self, together: Option<f64>) -> f64 {
         let gained = self.alone.map(|alone| together.map_or(0.0, |together| together - alone));
@@ -75,9 +69,9 @@ impl LaterLine {
 /// The lines of a seed, and those after them for as long as it is not known how far uncertain
 /// clocks shift them.
 ///
-/// A seed is solved as if its target were fast and an uncertain clock shifted each line by as much
-/// as a fast target flies in that time. Of a target at rest, whose lines no clock shifts, they say
-/// more than that; and of one that flies, as soon as its velocity is known.
+/// A seed is solved as if an uncertain clock shifted each line by what a target of typical speed
+/// flies in that time. Of a target at rest, whose lines no clock shifts, they say more than that;
+/// and of one that flies, as soon as its velocity is known.
 #[derive(Clone, Debug)]
 pub(super) struct FirstLines {
     /// Where the target is about.
@@ -86,8 +80,10 @@ pub(super) struct FirstLines {
     speed: f64,
     /// The log-likelihood ratio of the seed.
     score: f64,
-    // Shared by all hypotheses that grow from the seed.
+    /// Shared, as what follows is, by all hypotheses that grow from the seed.
     lines: Arc<[FirstLine]>,
+    /// What the seed's lines alone are, once it has been asked for.
+    begun: Arc<OnceLock<Option<(BySpeed<JointFilter>, f64)>>>,
     later: Vec<Arc<LaterLine>>,
     /// Variance to which the velocity was known when the lines were last taken in, m^2/s^2.
     known: f64,
@@ -102,14 +98,8 @@ impl FirstLines {
         speed: f64,
         score: f64,
     ) -> Self {
-        Self {
-            place,
-            speed,
-            score,
-            lines: lines.collect(),
-            later: Vec::new(),
-            known: speed.powi(2),
-        }
+        let (begun, later) = (Arc::default(), Vec::new());
+        Self { place, speed, score, lines: lines.collect(), begun, later, known: speed.powi(2) }
     }
 
     pub(super) fn score(&self) -> f64 {
@@ -126,15 +116,31 @@ impl FirstLines {
         })
     }
 
-    /// Whether a clock shifts any of them.
-    pub(super) fn have_unsure_clocks(&self) -> bool {
-        self.lines.iter().any(|first| first.uncertainty.time_sd_s > 0.0)
+    /// The target that gives the seed's lines, by the speed that it may have, and their
+    /// log-likelihood ratio; `None` if the numbers fail.
+    pub(super) fn begun(&self) -> Option<(BySpeed<JointFilter>, f64)> {
+        self.begun.get_or_init(|| self.by_speed(None)).clone()
     }
 
-    /// Whether the velocity is known twice as well as when the lines were last taken in.
-    pub(super) fn learn_velocity(&mut self, joint: &JointFilter) -> bool {
+    /// Whether the velocity is known so well that it is known how far the clocks shift all lines,
+    /// to better than the lines' own noise.
+    pub(super) fn are_shifts_known(&self, joint: &JointFilter) -> bool {
+        let is_known = |line: &SightLine, uncertainty: &CameraUncertainty| {
+            let time_sd_s = uncertainty.time_sd_s;
+            time_sd_s == 0.0 || joint.knows_shift(line, time_sd_s)
+        };
+        self.lines.iter().all(|first| is_known(&first.line, &first.uncertainty))
+            && self.later.iter().all(|later| is_known(&later.line, &later.uncertainty))
+    }
+
+    /// Whether the velocity is known twice as well as when the lines were last taken in, or if this
+    /// is the last time, better at all.
+    pub(super) fn learn_velocity(&mut self, joint: &JointFilter, is_last: bool) -> bool {
+        let has_unsure = |uncertainty: &CameraUncertainty| uncertainty.time_sd_s > 0.0;
+        let is_needed = self.lines.iter().any(|first| has_unsure(&first.uncertainty))
+            || self.later.iter().any(|later| has_unsure(&later.uncertainty));
         let known = joint.flown().variance();
-        let is_better = known < self.known / 4.0;
+        let is_better = is_needed && known < self.known * if is_last { 1.0 } else { 0.25 };
         if is_better {
             self.known = known;
         }

@@ -22,6 +22,10 @@ use crate::update::{MAX_ROUNDS, SETTLED};
 const MAX_ERRORS: usize = 4 * SHARED;
 /// Position and velocity.
 const STATE: usize = 6;
+/// A clock whose standard deviation has changed by a larger factor (logarithm) is known anew. With
+/// half of it one that has only walked for a minute is forgotten; with twice as much what is known
+/// of it is off by a fifth.
+const ANOTHER: f64 = 0.1;
 
 /// Kalman filter for position and velocity of a target and for the shared errors of its cameras.
 ///
@@ -62,6 +66,8 @@ struct CameraErrors {
     places: [Option<usize>; SHARED],
     /// Decay time of errors that last, s; the others do not decay.
     decay_s: f64,
+    /// Standard deviation of its clock, s: the unit of that error.
+    time_sd_s: Option<f64>,
 }
 
 /// A line's measurement equation, linearised at one place.
@@ -179,11 +185,13 @@ impl JointFilter {
     }
 
     /// Whether it is known how far an uncertain clock of this deviation (s) shifts a line, to
-    /// better than the line's own noise; by the velocity at the target's range.
+    /// better than the line's own noise.
     pub(super) fn knows_shift(&self, line: &SightLine, time_sd_s: f64) -> bool {
-        let range = (self.place() - line.origin).norm();
-        let unsure = self.flown().variance() * (time_sd_s / range).powi(2);
-        unsure < line.covariance.trace() / 2.0
+        let Some(model) = BearingModel::new(line.origin, self.place()) else { return false };
+        // E' P_v E sd(t)^2 / r^2.
+        let by = model.by_position();
+        let unsure = by * self.flown().covariance * by.transpose() * time_sd_s.powi(2);
+        unsure.trace() < line.covariance.trace()
     }
 
     fn velocity(&self) -> Vector3<f64> {
@@ -198,10 +206,13 @@ impl JointFilter {
         is_there: [bool; SHARED],
         decay_s: f64,
     ) -> [Option<usize>; SHARED] {
+        if is_there == [false; SHARED] {
+            return [None; SHARED];
+        }
         let known = self.cameras.iter().position(|errors| errors.camera == *camera);
         let index = known.unwrap_or_else(|| {
-            let places = [None; SHARED];
-            self.cameras.push(CameraErrors { camera: camera.clone(), places, decay_s });
+            let (camera, places) = (camera.clone(), [None; SHARED]);
+            self.cameras.push(CameraErrors { camera, places, decay_s, time_sd_s: None });
             self.cameras.len() - 1
         });
         let errors = &mut self.cameras[index];
@@ -221,6 +232,22 @@ impl JointFilter {
             self.covariance.view_mut((size, size), (added, added)).fill_with_identity();
         }
         std::array::from_fn(|error| places[error].filter(|_| is_there[error]))
+    }
+
+    /// Forgets the error of a camera's clock if that has become another, as by what another target
+    /// has told of it: its times are corrected anew then, and its deviation is another unit.
+    fn note_clock(&mut self, camera: &CameraName, time_sd_s: f64) {
+        let Some(errors) = self.cameras.iter_mut().find(|errors| errors.camera == *camera) else {
+            return;
+        };
+        let before = errors.time_sd_s.replace(time_sd_s);
+        let is_another = before.is_some_and(|before| (time_sd_s / before).ln().abs() > ANOTHER);
+        if let Some(clock) = errors.places[OF_CLOCK].filter(|_| is_another) {
+            self.mean[clock] = 0.0;
+            self.covariance.row_mut(clock).fill(0.0);
+            self.covariance.column_mut(clock).fill(0.0);
+            self.covariance[(clock, clock)] = 1.0;
+        }
     }
 
     /// Predicts to a time: constant velocity driven by white acceleration of this density, m^2/s^3.
@@ -272,6 +299,7 @@ impl JointFilter {
         let lasts = uncertainty.lasting.sd_rad > 0.0;
         let is_there = [has_error, has_error, uncertainty.time_sd_s > 0.0, lasts, lasts];
         let places = self.find_or_add(camera, is_there, uncertainty.lasting.time_s);
+        self.note_clock(camera, uncertainty.time_sd_s);
         let before = self.place();
         let at_first = self.correction(before, bearing, factor, places)?;
         let mut correction = at_first.clone();

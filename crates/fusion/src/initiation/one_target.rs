@@ -49,7 +49,8 @@ fn joint_of(track: &FusedTrack, speed: f64) -> BySpeed<JointFilter> {
 /// Both are predictive likelihoods: of models that are right, the ratio would exceed T with a
 /// probability of 1 / T at most where each camera sees something of its own, however long one
 /// looks. Not all of it is counted so: a camera's first line is compared with clutter, as is one
-/// that continues nothing that the camera has seen before, and a line outside the gate is a miss.
+/// that continues nothing that the camera has seen before, a line outside the gate is a miss, and
+/// lines that an uncertain clock shifts are taken in anew by what later ones tell of the velocity.
 #[derive(Clone, Debug, Default)]
 pub(super) struct OneTargetTest {
     /// Each camera's lines, followed as if that camera alone saw what gives them.
@@ -59,8 +60,8 @@ pub(super) struct OneTargetTest {
     first: Option<FirstLines>,
     /// All lines, followed as one target's; from the second ones on.
     joint: Option<BySpeed<JointFilter>>,
-    /// Cameras that should see the target and have given one line at most, with the log-likelihood
-    /// of their misses.
+    /// Cameras that should see the target and have given no two lines of an object, with the
+    /// log-likelihood of their misses.
     silent: Vec<(CameraName, f64)>,
     log_ratio: f64,
     /// Whether one camera has followed the target before the others see it.
@@ -129,8 +130,8 @@ impl OneTargetTest {
         joint.each(|joint| joint.predict(time, density));
         let together = joint.see(|joint| joint.see(bearing, factor));
         let gained = |log_density: f64| together.map_or(0.0, |together| together - log_density);
-        let own = own.filter(|own| gained(own.log_density) <= ratio);
-        if let Some(own) = own {
+        let alone = own.map(|own| own.log_density);
+        if let Some(own) = own.filter(|own| gained(own.log_density) <= ratio) {
             self.log_ratio += gained(own.log_density);
             self.own.go_on(own, line);
         } else {
@@ -138,7 +139,6 @@ impl OneTargetTest {
             self.see_first(bearing, speed / range, ratio);
         }
         if self.first.is_some() {
-            let alone = own.map(|own| own.log_density);
             self.learn_clocks(LaterLine::new(bearing, factor, density, alone, ratio));
         }
     }
@@ -146,8 +146,8 @@ impl OneTargetTest {
     /// The target that gives all lines, by the speed that it may have.
     fn joint(&mut self, before: &FusedTrack, speed: f64) -> &mut BySpeed<JointFilter> {
         self.joint.get_or_insert_with(|| {
-            let begun = self.first.as_ref().and_then(|first| first.by_speed(None));
-            self.first.take_if(|first| begun.is_none() || !first.have_unsure_clocks());
+            let begun = self.first.as_ref().and_then(FirstLines::begun);
+            self.first.take_if(|_| begun.is_none());
             let (joint, log_ratio) =
                 begun.unwrap_or_else(|| (joint_of(before, speed), self.log_ratio));
             self.log_ratio = log_ratio;
@@ -156,19 +156,18 @@ impl OneTargetTest {
     }
 
     /// Takes in all lines once more where this one has made the velocity, by which uncertain clocks
-    /// shift them, twice as well known.
+    /// shift them, twice as well known; and a last time when it is known well enough.
     fn learn_clocks(&mut self, later: LaterLine) {
         let (Some(first), Some(joint)) = (&mut self.first, &self.joint) else { return };
-        let is_told = joint.fastest().is_some_and(|joint| later.is_shift_known(joint));
         let has_room = first.keep(later);
-        if joint.fastest().is_some_and(|joint| first.learn_velocity(joint))
+        let Some(fastest) = joint.fastest() else { return };
+        let is_last = first.are_shifts_known(fastest) || !has_room;
+        if first.learn_velocity(fastest, is_last)
             && let Some((joint, log_ratio)) = first.by_speed(Some(joint))
         {
             (self.joint, self.log_ratio) = (Some(joint), log_ratio);
         }
-        if is_told || !has_room {
-            self.first = None;
-        }
+        self.first.take_if(|_| is_last);
     }
 
     /// Notes that the track has taken in a line that says nothing here.
