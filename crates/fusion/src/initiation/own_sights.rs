@@ -9,8 +9,8 @@ use super::speeds::{BySpeed, SPEEDS, SpeedCase};
 
 /// Most objects of one camera whose lines may be taken for one target's; the one that was seen
 /// least lately goes. With half of it, lines of two objects by turns are no object's, and fit one
-/// target better than any: 397 ghosts where there are 38 (`tests/ghosts.rs`, strangers before
-/// clocks of 30 ms).
+/// target better than any: 397 ghosts where there were 38 when it was tried (`tests/ghosts.rs`,
+/// strangers before clocks of 30 ms).
 const MAX_SIGHTS: usize = 3;
 
 /// What each camera sees by itself.
