@@ -66,6 +66,15 @@ impl LaterLine {
     }
 }
 
+/// What gives all lines, if that is one target.
+#[derive(Clone, Debug)]
+pub(super) struct JointTarget {
+    /// By the speed that it may have.
+    pub(super) by_speed: BySpeed<JointFilter>,
+    /// The log-likelihood ratio of the lines.
+    pub(super) log_ratio: f64,
+}
+
 /// The lines of a seed, and those after them for as long as it is not known how far uncertain
 /// clocks shift them.
 ///
@@ -83,7 +92,7 @@ pub(super) struct FirstLines {
     /// Shared, as what follows is, by all hypotheses that grow from the seed.
     lines: Arc<[FirstLine]>,
     /// What the seed's lines alone are, once it has been asked for.
-    begun: Arc<OnceLock<Option<(BySpeed<JointFilter>, f64)>>>,
+    begun: Arc<OnceLock<Option<JointTarget>>>,
     later: Vec<Arc<LaterLine>>,
     /// Variance to which the velocity was known when the lines were last taken in, m^2/s^2.
     known: f64,
@@ -116,9 +125,8 @@ impl FirstLines {
         })
     }
 
-    /// The target that gives the seed's lines, by the speed that it may have, and their
-    /// log-likelihood ratio; `None` if the numbers fail.
-    pub(super) fn begun(&self) -> Option<(BySpeed<JointFilter>, f64)> {
+    /// The target that gives the seed's lines; `None` if the numbers fail.
+    pub(super) fn begun(&self) -> Option<JointTarget> {
         self.begun.get_or_init(|| self.by_speed(None)).clone()
     }
 
@@ -153,13 +161,9 @@ impl FirstLines {
         self.later.len() < MAX_LATER
     }
 
-    /// The target that gives these lines, by the speed that it may have, and their log-likelihood
-    /// ratio. `known` is the same as it was found before, which tells how fast it flies: by that
-    /// clocks shift the lines. `None` if the numbers fail.
-    pub(super) fn by_speed(
-        &self,
-        known: Option<&BySpeed<JointFilter>>,
-    ) -> Option<(BySpeed<JointFilter>, f64)> {
+    /// The target that gives these lines; `known` is the same as it was found before, which tells
+    /// how fast it flies: by that clocks shift the lines. `None` if the numbers fail.
+    pub(super) fn by_speed(&self, known: Option<&BySpeed<JointFilter>>) -> Option<JointTarget> {
         let flown = known.map_or_else(Vec::new, |known| {
             known.filters().map(|joint| Some(joint.flown())).collect()
         });
@@ -184,7 +188,7 @@ impl FirstLines {
             log_ratio += later.gained(cases.see(|joint| joint.see(&bearing, *factor)));
         }
         cases.each(|joint| joint.assume_flown(None));
-        Some((cases, log_ratio))
+        Some(JointTarget { by_speed: cases, log_ratio })
     }
 
     /// A target of at most this speed (m/s) that gives the seed's lines, each taken in a certain

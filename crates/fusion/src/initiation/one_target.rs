@@ -3,7 +3,7 @@
 
 use crossfix_message::CameraName;
 
-use super::first_lines::{FirstLines, LaterLine};
+use super::first_lines::{FirstLines, JointTarget, LaterLine};
 use super::joint::JointFilter;
 use super::own_sights::OwnSights;
 use super::sight::DirectionFilter;
@@ -148,10 +148,11 @@ impl OneTargetTest {
         self.joint.get_or_insert_with(|| {
             let begun = self.first.as_ref().and_then(FirstLines::begun);
             self.first.take_if(|_| begun.is_none());
-            let (joint, log_ratio) =
-                begun.unwrap_or_else(|| (joint_of(before, speed), self.log_ratio));
+            let Some(JointTarget { by_speed, log_ratio }) = begun else {
+                return joint_of(before, speed);
+            };
             self.log_ratio = log_ratio;
-            joint
+            by_speed
         })
     }
 
@@ -163,9 +164,9 @@ impl OneTargetTest {
         let Some(fastest) = joint.fastest() else { return };
         let is_last = first.are_shifts_known(fastest) || !has_room;
         if first.learn_velocity(fastest, is_last)
-            && let Some((joint, log_ratio)) = first.by_speed(Some(joint))
+            && let Some(JointTarget { by_speed, log_ratio }) = first.by_speed(Some(joint))
         {
-            (self.joint, self.log_ratio) = (Some(joint), log_ratio);
+            (self.joint, self.log_ratio) = (Some(by_speed), log_ratio);
         }
         self.first.take_if(|_| is_last);
     }
