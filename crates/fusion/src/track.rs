@@ -9,6 +9,7 @@
 //! coordinates about the camera that alone sees it (`range_chart.rs`), as there the range that no
 //! bearing holds is one axis.
 
+mod draw;
 mod expectation;
 mod information;
 mod innovation;
@@ -34,11 +35,11 @@ use crate::uncertainty::CameraUncertainty;
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, bearing_update};
 use crate::visibility::Visibility;
 
+use draw::Course;
+pub(crate) use draw::Draw;
 pub(crate) use expectation::TrackExpectation;
-use innovation::BearingInnovation;
 use learnt::Learnt;
 use past::PastState;
-pub(crate) use ties::Draw;
 use ties::Ties;
 
 /// A target that just two cameras see counts as placed if its position is known to this share of
@@ -136,8 +137,8 @@ pub struct FusedTrack {
     pub(crate) comparisons: u32,
     /// Position of the camera that gave the newest bearing.
     follower: Option<Point3<f64>>,
-    /// When [`Self::draw`] last compared the cameras' bearings.
-    drawn: Timestamp,
+    /// What the cameras' bearings are compared with since the last [`Self::draw`].
+    course: Course,
     /// When its state was last published, and with which status.
     pub(crate) published: Option<(Timestamp, TrackStatus)>,
     imm: Imm,
@@ -185,7 +186,7 @@ impl FusedTrack {
             has_ends: false,
             comparisons: 0,
             follower: None,
-            drawn: fix.time,
+            course: Course::of(&fix.state, fix.time),
             published: None,
             imm: Imm::new(fix.state.clone(), motion.models(true)),
             ties: BTreeMap::new(),
@@ -442,7 +443,7 @@ impl FusedTrack {
         self.triangulated = self.ties.values().filter(lately).count() >= 2;
         let sees = |ties: &&Ties| ties.sees(time, self.holding_s);
         self.ranged = self.ties.values().filter(sees).count() >= 2;
-        self.gather(&bearing, &innovation);
+        self.gather(&bearing);
         let third_differences = self.third_differences(camera, line);
         Some(Taken { manoeuvre, third_differences })
     }
@@ -457,7 +458,8 @@ impl FusedTrack {
     /// Moves all times of the track: all clocks have stepped by `step_s` seconds.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         let residuals = self.residuals.values_mut().map(|residual| &mut residual.time);
-        let own = [&mut self.updated_at, &mut self.observed, &mut self.born, &mut self.drawn];
+        let own =
+            [&mut self.updated_at, &mut self.observed, &mut self.born, &mut self.course.since];
         for time in own.into_iter().chain(residuals) {
             *time = time.plus_seconds(step_s);
         }

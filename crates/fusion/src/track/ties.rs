@@ -7,10 +7,11 @@
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{Dyn, Matrix2, Matrix2x3, Matrix2x6, OMatrix, U5, Unit, Vector2, Vector3};
+use nalgebra::{Dyn, OMatrix, U5, Unit, Vector2};
 
-use super::{BearingInnovation, FusedTrack, TrackBearing};
-use crate::cameras::{ClockChange, RecentBearings, ScaleSample, ThirdDifferences};
+use super::draw::{Course, DRAW_S, Draw, Drawn};
+use super::{FusedTrack, TrackBearing};
+use crate::cameras::{ClockChange, RecentBearings, ThirdDifferences};
 use crate::uncertainty::{CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies};
 use crate::update::{CrossUpdate, ModelUpdate, Updated};
 use crate::visibility::Visibility;
@@ -32,11 +33,6 @@ pub(super) struct Rescaling {
 /// longer intervals noise cannot be told from jerk. By default that is 0.15 s: with half of it
 /// cameras of 10 Hz show nothing of their white noise.
 const CLOSE_BEARINGS: f64 = 0.1;
-/// A draw (one comparison of the cameras' mean residuals from the target) lasts this long, s: long
-/// enough for some bearings of each camera, short enough to see a mast sway. With half of it
-/// cameras of 5 Hz have one bearing per draw, or none.
-const DRAW_S: f64 = 0.3;
-
 /// A camera supports the track for at least this many times the interval between its last two
 /// bearings: the next one may be late (with half of it every next one is too late), but none may
 /// be missed, ...
@@ -90,93 +86,12 @@ pub(super) struct Ties {
     steady: (Vector2<f64>, u32),
 }
 
-/// What the cameras have seen of a target, compared with its track.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Draw {
-    /// The age of the track, s.
-    pub(crate) age_s: f64,
-    /// The residuals of the cameras that see the target.
-    pub(crate) samples: Vec<ScaleSample>,
-    /// Those of the cameras that for long have had something beside it in the same place: that may
-    /// be the target.
-    pub(crate) beside: Vec<ScaleSample>,
-}
-
-/// A camera's bearings of the target since the last draw, summed: see `cameras/pose_scale.rs`.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Drawn {
-    /// Sum of the residuals from the track, rad, and their number.
-    residuals: Vector2<f64>,
-    count: f64,
-    by_position: Matrix2x3<f64>,
-    /// Covariance of one bearing's noise, rad^2.
-    noise: Matrix2<f64>,
-    /// The part of the noise that lasts, and so is not averaged away.
-    lasting: CorrelatedNoise,
-    pose: Matrix2<f64>,
-    by_pose: Matrix2x6<f64>,
-    by_time: Vector2<f64>,
-    /// Standard deviation of the clock, s.
-    time_sd_s: f64,
-}
-
-impl Drawn {
-    /// The sums with one bearing more.
-    fn with(
-        before: Option<Self>,
-        innovation: &BearingInnovation,
-        velocity: Vector3<f64>,
-        TrackBearing { line, uncertainty, .. }: &TrackBearing<'_>,
-    ) -> Self {
-        let (residuals, count) =
-            before.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.residuals, drawn.count));
-        Self {
-            residuals: residuals + innovation.residual,
-            count: count + 1.0,
-            by_position: innovation.model.by_position(),
-            noise: innovation.model.covariance_of(line) * uncertainty.factor,
-            lasting: uncertainty.lasting,
-            pose: uncertainty.declared_pose(&innovation.model),
-            by_pose: innovation.model.by_pose(),
-            by_time: innovation.model.by_time(velocity),
-            time_sd_s: uncertainty.time_sd_s,
-        }
-    }
-
-    /// The mean residual as a sample, for a target whose velocity has a standard deviation of
-    /// `speed`, m/s.
-    fn sample(self, camera: &CameraName, speed: f64) -> ScaleSample {
-        // The mean times of the cameras' bearings differ, by a tenth of a draw as assumed here.
-        let moved = self.by_position * (speed * DRAW_S / 10.0);
-        // White noise averages out over the bearings; what an unknown velocity does within a draw
-        // does not.
-        let white = self.noise / self.count + moved * moved.transpose();
-        // The clock's effect is computed with the estimated velocity, and is as uncertain as that.
-        let by_speed = self.by_position * (speed * self.time_sd_s);
-        let lasting = Matrix2::identity() * self.lasting.as_white(DRAW_S);
-        ScaleSample {
-            camera: camera.clone(),
-            residual: self.residuals / self.count,
-            by_position: self.by_position,
-            // The lasting part does not average out within a draw; for the watch, over many draws,
-            // it does as slowly as white noise of `as_white`.
-            noise: white + Matrix2::identity() * self.lasting.variance(),
-            pose: self.pose,
-            by_pose: self.by_pose,
-            by_time: self.by_time,
-            clock_sd_s: self.time_sd_s,
-            slow_noise: white + lasting + by_speed * by_speed.transpose(),
-            noise_lasts: self.lasting.sd_rad > 0.0,
-        }
-    }
-}
-
 impl Ties {
     /// What the camera has seen beside the target since the last draw, if that has stayed in the
     /// same place for at least [`STEADY_DRAWS`] draws.
     fn steady_beside(&mut self) -> Option<Drawn> {
         let beside = self.beside.take().filter(|_| self.drawn.is_none());
-        let place = beside.map(|drawn| drawn.residuals / drawn.count);
+        let place = beside.map(|drawn| drawn.mean());
         let (before, draws) = self.steady;
         // The residual may change by a share of itself: what passes by changes it by more.
         let stays = place.is_some_and(|place| (place - before).norm() < STEADY * before.norm());
@@ -304,10 +219,11 @@ impl FusedTrack {
     }
 
     /// Adds a bearing of the target to the next draw.
-    pub(super) fn gather(&mut self, bearing: &TrackBearing<'_>, innovation: &BearingInnovation) {
+    pub(super) fn gather(&mut self, bearing: &TrackBearing<'_>) {
         let velocity = self.state().velocity();
-        if let Some(ties) = self.ties.get_mut(bearing.camera) {
-            ties.drawn = Some(Drawn::with(ties.drawn, innovation, velocity, bearing));
+        let residual = self.course.residual(bearing);
+        if let (Some(residual), Some(ties)) = (residual, self.ties.get_mut(bearing.camera)) {
+            ties.drawn = Some(Drawn::with(ties.drawn, &residual, velocity, bearing));
         }
     }
 
@@ -315,34 +231,33 @@ impl FusedTrack {
     /// of the target; whether it may be the target's, if the camera is turned.
     pub(crate) fn gather_beside(&mut self, bearing: &TrackBearing<'_>, may_be_it: bool) {
         let velocity = self.state().velocity();
-        let innovation = self.innovation(bearing.time, bearing.line);
-        if let (Some(innovation), Some(ties)) = (innovation, self.ties.get_mut(bearing.camera)) {
-            ties.beside = Some(Drawn::with(ties.beside, &innovation, velocity, bearing));
+        let residual = self.course.residual(bearing);
+        if let (Some(residual), Some(ties)) = (residual, self.ties.get_mut(bearing.camera)) {
+            ties.beside = Some(Drawn::with(ties.beside, &residual, velocity, bearing));
             ties.may_be_it &= may_be_it;
         }
     }
 
-    /// The cameras' mean residuals since the last draw, if the next draw is due; empty otherwise.
-    /// If at least as many cameras as see the target have for long had something beside it in the
-    /// same place, that is the target, and their poses are worse than stated: these residuals are
-    /// then included.
+    /// The cameras' residuals in the middle of the time since the last draw, if the next draw is due; empty
+    /// otherwise. If at least as many cameras as see the target have for long had something beside
+    /// it in the same place, that is the target, and their poses are worse than stated: these
+    /// residuals are then included.
     pub(crate) fn draw(&mut self) -> Draw {
-        if self.updated_at.seconds_since(self.drawn) < DRAW_S {
+        if self.updated_at.seconds_since(self.course.since) < DRAW_S {
             return Draw::default();
         }
-        self.drawn = self.updated_at;
-        // The cameras see the target at different times within a draw: an uncertain velocity moves
-        // it in between.
+        let middle_s = self.updated_at.seconds_since(self.course.since) / 2.0;
+        self.course = Course::of(self.state(), self.updated_at);
+        // At most this along any axis: how a target turns while the track lags behind is in it.
         let speed = self.state().covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt();
         let (mut samples, mut beside) = (Vec::new(), Vec::new());
         for (camera, ties) in &mut self.ties {
             let steady = ties.steady_beside();
             let may_be_it = std::mem::replace(&mut ties.may_be_it, true);
+            let sample = |drawn: Drawn| drawn.sample(camera, speed, middle_s);
             match ties.drawn.take() {
-                Some(drawn) => samples.push(drawn.sample(camera, speed)),
-                None => {
-                    beside.extend(steady.map(|drawn| (drawn.sample(camera, speed), may_be_it)));
-                }
+                Some(drawn) => samples.push(sample(drawn)),
+                None => beside.extend(steady.map(|drawn| (sample(drawn), may_be_it))),
             }
         }
         if beside.len() >= samples.len().max(LEAST_BESIDE) {
