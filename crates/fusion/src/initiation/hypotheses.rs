@@ -1,25 +1,27 @@
 //! Multi-hypothesis initiation: possible targets are followed in every way that the bearings allow,
 //! until one explanation of the bearings is by far the best.
 
+mod confirmation;
 mod pruning;
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use confirmation::numbers_of_lines;
 use crossfix_message::{CameraName, Solver, Timestamp};
 
 use super::first_lines::{FirstLine, FirstLines};
 use super::one_target::{Mobility, OneTargetTest};
 use super::rooted_lines::RootedLines;
 use super::seeds::{Seed, SeedFinder};
-use super::selection::{PeriodLine, ScoredLines, Selection};
+use super::selection::PeriodLine;
 use super::{MAX_LINES, NewTrack};
 use crate::cameras::{Cameras, KnownCamera, Rooted};
 use crate::comparison::{Candidate, Comparison, ComparisonRules};
-use crate::evidence::{BEYOND_DOUBT, ONE_IN_A_HUNDRED};
+use crate::evidence::BEYOND_DOUBT;
 use crate::motion::MotionSetup;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
-use crate::track::{FusedTrack, StartLine, TrackExpectation, TrackId, TrackStatus};
-use crate::tracker::{UsedSighting, same_target};
+use crate::track::{FusedTrack, StartLine, TrackExpectation, TrackId};
+use crate::tracker::UsedSighting;
 use crate::uncertainty::CameraUncertainty;
 use crate::visibility::log_missed;
 use crate::{Exposure, FusionConfig};
@@ -112,63 +114,6 @@ impl Hypothesis {
     /// Whether a camera's newest line is of something that stands in its view.
     fn rooted(&self, camera: &CameraName) -> Rooted {
         self.said.get(camera).map_or_else(Rooted::default, |said| said.rooted)
-    }
-
-    /// Whether enough cameras agree on it: three, or two for at least `pair_s` seconds. Lines of
-    /// two targets, each seen by another one of two cameras, may cross for a while; and what one
-    /// camera gave may be clutter, whatever the other one follows meanwhile: any line that lies
-    /// near the plane of the other's makes a target with it.
-    fn agrees(&self, pair_s: f64, lines: &BTreeMap<&CameraName, LineCounts>) -> bool {
-        let cameras = self.cameras();
-        if cameras.len() >= 3 {
-            return true;
-        }
-        let all = |camera: &&CameraName| lines.get(*camera).map_or(1, |counts| counts.all);
-        let choices: f64 = cameras.iter().map(|camera| log_number(all(camera))).sum();
-        let is_sure = |said: &Said| said.evidence >= BEYOND_DOUBT + choices;
-        cameras.into_iter().all(|camera| self.said.get(camera).is_some_and(is_sure))
-            && self.track.updated_at.seconds_since(self.born) >= pair_s
-            && self.track.is_placed()
-    }
-
-    /// The cameras in whose views what it is made of stands, if all of it does but for one line at
-    /// most, which may be clutter (of two cameras, but for none).
-    fn rooted_cameras(&self) -> Option<Vec<&CameraName>> {
-        let cameras = self.cameras();
-        let clutter = usize::from(cameras.len() > 2);
-        let (rooted, others): (Vec<_>, Vec<_>) =
-            cameras.into_iter().partition(|camera| self.rooted(camera) == Rooted::Yes);
-        (others.len() <= clutter).then_some(rooted)
-    }
-
-    /// Whether what stands in the cameras' views explains it: not if so little stands there that it
-    /// crosses nowhere by chance. As long as this is unknown of a line (its camera has only begun
-    /// to look), two cameras are not enough.
-    fn stands(&self, lines: &RootedLines) -> bool {
-        let cameras = self.cameras();
-        let is_unknown = cameras.iter().any(|camera| self.rooted(camera) == Rooted::Unknown);
-        (is_unknown && cameras.len() == 2)
-            || self.rooted_cameras().is_some_and(|rooted| lines.may_cross(rooted.into_iter()))
-    }
-
-    /// Least log-likelihood ratio of one target against an object per camera with which it is
-    /// confirmed: the logarithm of the number of sets of lines that it may have been chosen from by
-    /// chance, the product of the numbers of its cameras' lines. What stands in a view is counted
-    /// where the hypothesis has such a line, but not for two cameras, of which one line at least
-    /// has come or moved: a target that flies slowly passes for standing before one of them, and
-    /// would be found ten seconds later. If none of its lines has been seen to come or to move, and
-    /// how many things stand in the views is not known yet, it must be a hundred times likelier.
-    fn least_one_target_ratio(&self, lines: &BTreeMap<&CameraName, LineCounts>) -> f64 {
-        let cameras = self.cameras();
-        let moves = cameras.iter().any(|camera| self.rooted(camera) == Rooted::No);
-        let choices = cameras.iter().map(|camera| {
-            let may_stand = self.rooted(camera) == Rooted::Yes;
-            let count_all = may_stand && (cameras.len() > 2 || !moves);
-            let number = |counts: &LineCounts| if count_all { counts.all } else { counts.others };
-            log_number(lines.get(camera).map_or(1, number))
-        });
-        let is_unknown = !moves && self.rooted_cameras().is_none();
-        choices.sum::<f64>() - if is_unknown { ONE_IN_A_HUNDRED } else { 0.0 }
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {
@@ -390,95 +335,4 @@ impl Hypotheses {
             });
         }
     }
-
-    /// Confirms hypotheses: those of the best set without common lines that are likely enough and
-    /// have no rival. The log-likelihood ratio of one target against a target per camera must reach
-    /// the logarithm of the number of sets of lines that may look like one target by chance.
-    fn confirm(
-        &mut self,
-        now: Timestamp,
-        lines: &BTreeMap<&CameraName, LineCounts>,
-        motion: &MotionSetup,
-    ) -> Vec<NewTrack> {
-        // Sorted by score: the rest have scores of 0 and less, which are never chosen.
-        let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
-        let scored = likely.map(|h| ScoredLines { score: h.track.score, lines: &h.lines });
-        let selection = Selection::new(scored, self.shared_lines);
-        let state = |i: usize| self.hypotheses[i].track.predicted(now, motion);
-        let is_likely = |&i: &usize| {
-            let hypothesis = &self.hypotheses[i];
-            self.is_likely(hypothesis, lines) && !hypothesis.stands(&self.rooted_lines)
-        };
-        let likely = selection.chosen().filter(is_likely);
-        let has_no_rival = |&i: &usize| {
-            let own = state(i);
-            selection.margin_of(i, |k| same_target(&own, &state(k))) >= BEYOND_DOUBT
-        };
-        let sure: Vec<usize> = likely.filter(has_no_rival).collect();
-        let lines: BTreeSet<LineId> = sure
-            .iter()
-            .flat_map(|&i| &self.hypotheses[i].lines)
-            .map(|line| line.id.clone())
-            .collect();
-        let starts = sure.iter().map(|&i| self.start(&self.hypotheses[i])).collect();
-        if !lines.is_empty() {
-            self.hypotheses.retain(|h| h.lines.iter().all(|line| !lines.contains(&line.id)));
-        }
-        if !self.provisional.is_empty() {
-            let alive: BTreeSet<&LineId> =
-                self.hypotheses.iter().flat_map(|h| &h.lines).map(|line| &line.id).collect();
-            self.provisional.retain(|id, _| alive.contains(id));
-        }
-        starts
-    }
-
-    /// Whether a hypothesis is likely enough to be confirmed if it has no rival, given the numbers
-    /// of the cameras' lines.
-    fn is_likely(
-        &self,
-        hypothesis: &Hypothesis,
-        lines: &BTreeMap<&CameraName, LineCounts>,
-    ) -> bool {
-        let least = hypothesis.least_one_target_ratio(lines);
-        let is_one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= least);
-        hypothesis.agrees(self.pair_s, lines)
-            && is_one
-            && hypothesis.track.score >= self.confirm_score
-            && hypothesis.periods >= self.needed
-    }
-
-    fn start(&self, hypothesis: &Hypothesis) -> NewTrack {
-        let mut track = FusedTrack::clone(&hypothesis.track);
-        track.status = TrackStatus::Confirmed;
-        track.observe();
-        let lines = hypothesis.lines.iter();
-        let provisional_owners =
-            lines.filter_map(|line| self.provisional.get(&line.id)).copied().collect();
-        NewTrack { track, cameras: hypothesis.cameras().len(), provisional_owners }
-    }
-}
-
-/// Numbers of lines of a camera in an exposure.
-#[derive(Clone, Copy, Debug, Default)]
-struct LineCounts {
-    all: usize,
-    /// Those of which it is not known that they are of something that stands in its view.
-    others: usize,
-}
-
-/// Logarithm of a number of lines, of which there is at least one.
-fn log_number(lines: usize) -> f64 {
-    (lines.max(1) as f64).ln()
-}
-
-/// Numbers of lines of each camera in an exposure, the largest of the period.
-fn numbers_of_lines<'a>(exposures: &[&'a Exposure]) -> BTreeMap<&'a CameraName, LineCounts> {
-    let mut lines: BTreeMap<&CameraName, LineCounts> = BTreeMap::new();
-    for exposure in exposures {
-        let others = exposure.sightings.iter().filter(|sighting| sighting.rooted != Rooted::Yes);
-        let most = lines.entry(&exposure.camera).or_default();
-        most.all = most.all.max(exposure.sightings.len());
-        most.others = most.others.max(others.count());
-    }
-    lines
 }
