@@ -97,10 +97,10 @@ fn a_lucky_pose_is_not_taken_for_an_exact_one() {
 /// each other by chance as those of a camera that is off.
 #[test]
 fn exact_poses_are_found_to_be_exact() {
-    const SITES: usize = 200;
-    for (cameras, most_m, mean_m) in [(2, 0.09, 0.0735), (3, 0.06, 0.0555)] {
+    const SITES: u64 = 40;
+    for (cameras, most_m, mean_m) in [(2, 0.09, 0.075), (3, 0.06, 0.056)] {
         let mut claims = Vec::new();
-        for seed in 0..SITES as u64 {
+        for seed in 0..SITES {
             let answers = answers(&site()[..cameras], 0.0, seed);
             let late = &answers[answers.len() / 2..];
             let stated = late.iter().map(|[metres, deviations]| metres / deviations).sum::<f64>();
@@ -108,18 +108,12 @@ fn exact_poses_are_found_to_be_exact() {
             let squares: f64 = late.iter().map(|[_, deviations]| deviations.powi(2)).sum();
             assert!(squares / (late.len() as f64) < 3.0, "{cameras}, seed {seed}: {squares}");
         }
-        claims.sort_by(f64::total_cmp);
-        let unsure =
-            |factor: f64| claims.iter().filter(|metres| **metres >= factor * most_m).count();
-        println!(
-            "{cameras} cameras: {}, {} of {SITES}, {:?}",
-            unsure(1.0),
-            unsure(1.1),
-            claims.last()
+        let unsure = claims.iter().filter(|metres| **metres >= most_m).count();
+        assert!(unsure <= SITES as usize / 20, "{cameras} cameras: {claims:?}");
+        assert!(
+            claims.iter().all(|metres| *metres < 1.1 * most_m),
+            "{cameras} cameras: {claims:?}"
         );
-        assert!(unsure(1.0) <= SITES / 20, "{cameras} cameras: {}", unsure(1.0));
-        assert!(unsure(1.1) <= SITES / 40, "{cameras} cameras: {}", unsure(1.1));
-        assert_eq!(unsure(1.5), 0, "{cameras} cameras: {claims:?}");
         let mean = claims.iter().sum::<f64>() / claims.len() as f64;
         assert!(mean < mean_m, "{cameras} cameras: {mean} m");
     }
