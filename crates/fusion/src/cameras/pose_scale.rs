@@ -16,8 +16,9 @@ use super::watch::LONGEST_DRAW_S;
 use super::{Cameras, NOTICED};
 
 /// Time constant of the running means, s in which targets are seen, however many these are. With
-/// half of it tracks before exact poses claim less than these are good for; with four times as much
-/// a clock that is off is taken for poses that are.
+/// half of it the tracks of four cameras a metre off have a median NEES of 9.2 in place of 8.9; with
+/// four times as much 0.4 % of the answers of three cameras whose errors last for seconds are beyond
+/// four deviations, and not less than 0.3 (`tests/beside.rs`).
 const MEMORY_S: f64 = 3.0;
 /// Weight of the site's typical factor in the estimate of a camera's own, in degrees of freedom: a
 /// draw has two, less what the target's place takes of them, and a pose errs once, however many
