@@ -396,7 +396,7 @@ impl Fusion {
             let least = if age_s < PAIR_BELIEVED_AFTER_S { 3 } else { 2 };
             let mut changed = Vec::new();
             if samples.len() >= least {
-                changed = self.cameras.learn_poses(&samples, now);
+                changed = self.cameras.learn_poses(&samples);
             }
             // Where three others see the target, it is for them to accuse who sees something beside
             // it; where two do, however new their track is, any of the three may have been moved.

@@ -8,24 +8,23 @@
 //! about equally good. Where nobody has declared a pose's deviation, the estimate starts from that
 //! of a careful survey. A clock that is off by more than its camera says looks like a pose that is.
 
-use crossfix_message::{CameraName, Timestamp};
+use crossfix_message::CameraName;
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Vector2};
 
 use super::meeting::Meeting;
-use super::watch::LONGEST_DRAW_S;
 use super::{Cameras, NOTICED};
 
-/// Time constant of the running means, s in which targets are seen, however many these are. With
-/// half of it the tracks of four cameras a metre off have a median NEES of 9.2 in place of 8.9; with
-/// four times as much 0.4 % of the answers of three cameras whose errors last for seconds are beyond
-/// four deviations, and not less than 0.3 (`tests/beside.rs`).
-const MEMORY_S: f64 = 3.0;
+/// Share of a draw in the running means, once there are enough. A draw lasts a third of a second:
+/// the means remember some three seconds of one target. With half of it a site would take a minute
+/// to learn how good its poses are.
+const DRAW_SHARE: f64 = 0.1;
 /// Weight of the site's typical factor in the estimate of a camera's own, in degrees of freedom: a
 /// draw has two, less what the target's place takes of them, and a pose errs once, however many
 /// draws show it. Cameras of one site have been surveyed alike. Without it two of four cameras
 /// would be taken to be perfect, and the others to be worse than they are: the lines tell of fewer
-/// errors than there are. With 0.2 the tracks of four cameras a metre off have a median NEES of 10
-/// in place of 9; with 0.5 a camera that is off by 0.2 degrees draws the others with it.
+/// errors than there are. With 0.2 tracks of four cameras a metre off have a median NEES of 10 in
+/// place of 9 (of the position); with 0.5 a camera that is off by 0.2 degrees draws the others with
+/// it.
 const TYPICAL_WEIGHT: f64 = 0.3;
 /// Largest change of a factor (variance) in one step, so that a camera that is knocked is
 /// recognised in two seconds. With half of it that takes five, with twice as much one wrong start
@@ -54,11 +53,11 @@ const DOUBTED: f64 = 9.0;
 #[derive(Clone, Debug)]
 pub(crate) struct ScaleSample {
     pub(crate) camera: CameraName,
-    /// Mean residual of its bearings from the track, rad.
+    /// Residual of its bearings from a straight course, in the middle of the draw, rad.
     pub(crate) residual: Vector2<f64>,
     /// Derivative of the residual by the target's place, rad/m.
     pub(crate) by_position: Matrix2x3<f64>,
-    /// Covariance of the mean residual by noise alone, rad^2.
+    /// Covariance of the residual by noise alone, rad^2.
     pub(crate) noise: Matrix2<f64>,
     /// Shift of the residual by the declared pose error: a root of its covariance, rad.
     pub(crate) pose: Matrix2<f64>,
@@ -119,8 +118,6 @@ pub(super) struct PoseScale {
     all_worse_by: f64,
     /// Whether somebody has declared the pose's deviation.
     is_declared: bool,
-    /// When the camera was last drawn, and how many draws the running means remember.
-    drawn: Option<Timestamp>,
     draws: f64,
     /// Running means of the camera's squared pose error by the draws, and of its expectation.
     found: f64,
@@ -138,7 +135,6 @@ impl PoseScale {
             least: 1.0,
             all_worse_by: 0.0,
             is_declared,
-            drawn: None,
             draws: 0.0,
             found: 0.0,
             expected: 0.0,
@@ -169,15 +165,13 @@ impl PoseScale {
 
     /// Takes in the squared pose error of a draw, with the typical factor of the site's cameras;
     /// returns by how much the tracks' factor changes, if it does.
-    fn learn(&mut self, error: SquaredPoseError, typical: f64, now: Timestamp) -> Option<f64> {
+    fn learn(&mut self, error: SquaredPoseError, typical: f64) -> Option<f64> {
         let SquaredPoseError { found, expected } = error;
         if !(found.is_finite() && expected.is_finite() && expected > 0.0) {
             return None;
         }
-        let last = self.drawn.replace(now);
-        let since = last.map_or(0.0, |last| now.seconds_since(last).clamp(0.0, LONGEST_DRAW_S));
-        self.draws = 1.0 + self.draws * (-since / MEMORY_S).exp();
-        let share = self.draws.recip();
+        self.draws += 1.0;
+        let share = self.draws.recip().max(DRAW_SHARE);
         // No one draw says that a camera is far worse than it was.
         let found = found.min(expected * MAX_DRAW_RATIO);
         self.found += (found - self.found) * share;
@@ -230,11 +224,7 @@ impl PoseScale {
 impl Cameras {
     /// Takes in what cameras have seen of a target; returns those whose pose's factor has changed,
     /// each with the ratio.
-    pub(crate) fn learn_poses(
-        &mut self,
-        samples: &[ScaleSample],
-        now: Timestamp,
-    ) -> Vec<(CameraName, f64)> {
+    pub(crate) fn learn_poses(&mut self, samples: &[ScaleSample]) -> Vec<(CameraName, f64)> {
         let Some(errors) = self.squared_errors(samples) else {
             return Vec::new();
         };
@@ -242,7 +232,7 @@ impl Cameras {
         let drawn = samples.iter().zip(errors);
         let changed = drawn.filter_map(|(sample, error)| {
             let scale = &mut self.get_mut(&sample.camera)?.pose_scale;
-            Some((sample.camera.clone(), scale.learn(error, typical, now)?))
+            Some((sample.camera.clone(), scale.learn(error, typical)?))
         });
         changed.collect()
     }
@@ -314,9 +304,9 @@ mod tests {
         let [alone, drawn] = [0.0, 100.0].map(|all_worse_by| {
             let mut scale = PoseScale::new(false);
             scale.judge(Moved::default(), Some(Surveyed { least: LEAST_SCALE, all_worse_by }));
-            for draw in 0..300 {
+            for _ in 0..300 {
                 let error = SquaredPoseError { found: 1.0 / scale.value, expected: 1.0 };
-                scale.learn(error, 1.0, Timestamp::from_seconds(0.3 * f64::from(draw)));
+                scale.learn(error, 1.0);
             }
             scale.value
         });

@@ -31,7 +31,7 @@ use memory::{ErrorEstimate, Memory};
 const MEMORIES_S: [f64; 2] = [20.0, 100.0];
 /// Longest time that counts between two successive draws, s: in a pause without a target nothing is
 /// learnt. With half of it the same: a draw lasts a third of a second.
-pub(super) const LONGEST_DRAW_S: f64 = 1.0;
+const LONGEST_DRAW_S: f64 = 1.0;
 /// Degrees of freedom of Student's t: lines that miss each other by far more than anything explains
 /// are of two targets, and have the weight that this distribution gives them. With half of it such
 /// lines count a quarter less.

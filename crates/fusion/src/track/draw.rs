@@ -18,6 +18,11 @@ use crate::uncertainty::CorrelatedNoise;
 /// mast sway. With half of it cameras of 5 Hz have one bearing per draw, or none.
 pub(super) const DRAW_S: f64 = 0.3;
 
+/// A course that began longer ago than this is no longer where the target may be, s: a track that
+/// waits to be confirmed, or that one camera alone has seen, is not drawn. With half of it cameras
+/// of half a hertz are not compared; with twice as much a turn of that time shows in the residuals.
+pub(super) const LONGEST_COURSE_S: f64 = 2.5;
+
 /// What the cameras have seen of a target.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Draw {
@@ -36,12 +41,15 @@ pub(super) struct Course {
     pub(super) since: Timestamp,
     position: Point3<f64>,
     velocity: Vector3<f64>,
+    /// Standard deviation of the velocity when it began, m/s.
+    pub(super) speed_sd: f64,
 }
 
 impl Course {
     /// From this state on.
     pub(super) fn of(state: &KinematicState, since: Timestamp) -> Self {
-        Self { since, position: state.position(), velocity: state.velocity() }
+        let (position, velocity) = (state.position(), state.velocity());
+        Self { since, position, velocity, speed_sd: speed_sd(state) }
     }
 
     /// By how much a bearing passes beside it.
@@ -53,6 +61,12 @@ impl Course {
         let model = BearingModel::new(line.origin, self.position + self.velocity * after_s)?;
         Some(Residual { after_s, angles: model.residual(line)?, model })
     }
+}
+
+/// Standard deviation of the velocity, m/s: that of all axes together, more than along any one. How
+/// a target turns while the track lags behind is in it.
+pub(super) fn speed_sd(state: &KinematicState) -> f64 {
+    state.covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt()
 }
 
 /// By how much a bearing passes beside a course.
@@ -101,13 +115,13 @@ impl Drawn {
         }
     }
 
-    /// Mean residual, rad.
+    /// Mean residual of the bearings, each at its own time, rad.
     pub(super) fn mean(&self) -> Vector2<f64> {
         self.residuals.of_angles / self.residuals.count
     }
 
     /// The residual at a time since the course began (s), for a target whose velocity has a
-    /// standard deviation of `speed` along any axis, m/s.
+    /// standard deviation of `speed`, m/s.
     pub(super) fn sample(self, camera: &CameraName, speed: f64, at_s: f64) -> ScaleSample {
         // Residuals drift by A v where the velocity differs by v.
         let drift = self.by_position * self.by_position.transpose() * speed.powi(2);
@@ -162,7 +176,7 @@ impl ResidualSums {
         // r(T) = 1'V^-1 r / 1'V^-1 1 with V = I + q u u' and u = t - T, so that
         // (1 + q u'u) V^-1 = (1 + q u'u) I - q u u'.
         let offsets = self.of_times - self.count * time_s;
-        let squares = self.of_squares - time_s * (self.of_times + offsets);
+        let squares = (self.of_squares - time_s * (self.of_times + offsets)).max(0.0);
         let products = self.of_products - self.of_angles * time_s;
         let whole = 1.0 + drift * squares;
         // 1'1 u'u - (1'u)^2 is not negative.

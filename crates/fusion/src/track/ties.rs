@@ -9,7 +9,7 @@ use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Dyn, OMatrix, U5, Unit, Vector2};
 
-use super::draw::{Course, DRAW_S, Draw, Drawn};
+use super::draw::{Course, DRAW_S, Draw, Drawn, LONGEST_COURSE_S, speed_sd};
 use super::{FusedTrack, TrackBearing};
 use crate::cameras::{ClockChange, RecentBearings, ThirdDifferences};
 use crate::uncertainty::{CorrelatedNoise, LASTING, OF_CLOCK, OF_POSE, SharedTies};
@@ -218,12 +218,24 @@ impl FusedTrack {
         tied
     }
 
-    /// Adds a bearing of the target to the next draw.
+    /// Adds a bearing of the target, which the track has taken in, to the next draw.
     pub(super) fn gather(&mut self, bearing: &TrackBearing<'_>) {
+        if bearing.time.seconds_since(self.course.since) > LONGEST_COURSE_S {
+            self.begin_course();
+            return;
+        }
         let velocity = self.state().velocity();
         let residual = self.course.residual(bearing);
         if let (Some(residual), Some(ties)) = (residual, self.ties.get_mut(bearing.camera)) {
             ties.drawn = Some(Drawn::with(ties.drawn, &residual, velocity, bearing));
+        }
+    }
+
+    /// Begins the next draw with what the track knows now.
+    pub(crate) fn begin_course(&mut self) {
+        self.course = Course::of(self.state(), self.updated_at);
+        for ties in self.ties.values_mut() {
+            (ties.drawn, ties.beside) = (None, None);
         }
     }
 
@@ -247,9 +259,8 @@ impl FusedTrack {
             return Draw::default();
         }
         let middle_s = self.updated_at.seconds_since(self.course.since) / 2.0;
+        let speed = self.course.speed_sd.max(speed_sd(self.state()));
         self.course = Course::of(self.state(), self.updated_at);
-        // At most this along any axis: how a target turns while the track lags behind is in it.
-        let speed = self.state().covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt();
         let (mut samples, mut beside) = (Vec::new(), Vec::new());
         for (camera, ties) in &mut self.ties {
             let steady = ties.steady_beside();

@@ -259,6 +259,7 @@ impl Handover {
                 track.score = self.rules.tracking.confirm_score;
                 track.born = track.updated_at;
                 track.observe();
+                track.begin_course();
                 found.push(track);
             }
         }

@@ -137,7 +137,9 @@ impl Hypotheses {
         }
         // Sorted by score: the first one is the best.
         self.hypotheses.iter().find(|other| {
-            other.lines == chosen.lines && self.is_likely(other, lines, chosen.periods)
+            other.lines == chosen.lines
+                && other.said.keys().all(|camera| cameras.contains(camera))
+                && self.is_likely(other, lines, chosen.periods)
         })
     }
 
@@ -162,6 +164,7 @@ impl Hypotheses {
         let mut track = FusedTrack::clone(&hypothesis.track);
         track.status = TrackStatus::Confirmed;
         track.observe();
+        track.begin_course();
         let lines = hypothesis.lines.iter();
         let provisional_owners =
             lines.filter_map(|line| self.provisional.get(&line.id)).copied().collect();
