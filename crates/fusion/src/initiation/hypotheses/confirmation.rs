@@ -118,7 +118,8 @@ impl Hypotheses {
     /// What is confirmed in the place of a chosen hypothesis, if that has no rival: itself, if it is
     /// likely enough.
     ///
-    /// The oldest hypothesis with its lines has the greatest score, whatever is wrong with its past.
+    /// The best of the hypotheses with its lines, as a rule the oldest, is chosen by its score,
+    /// whatever is wrong with its past.
     /// If lines of a camera went into that which has given none since, another with the same lines
     /// of late may be confirmed. As that may have begun in any of its periods, it must be likelier
     /// by the number of these.
@@ -164,7 +165,6 @@ impl Hypotheses {
         let mut track = FusedTrack::clone(&hypothesis.track);
         track.status = TrackStatus::Confirmed;
         track.observe();
-        track.begin_course();
         let lines = hypothesis.lines.iter();
         let provisional_owners =
             lines.filter_map(|line| self.provisional.get(&line.id)).copied().collect();
